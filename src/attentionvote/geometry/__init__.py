@@ -1,0 +1,1 @@
+"""Pure geometry in numpy and scipy: poses, symmetries, point clouds, neighbourhoods."""

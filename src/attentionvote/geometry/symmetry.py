@@ -1,0 +1,109 @@
+"""Proper symmetries of a part: which rotations leave its surface where it is.
+
+Finite groups (none, cyclic, dihedral, or an explicit list such as a cube's) are enumerated;
+a body of revolution has a continuum of them and is described by its axis and whether it may also be
+turned over (``flip``). Mirror images are never symmetries of a rigid pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.geometry.pose import matrix_from_quaternion, rotation_about
+
+Kind = Literal["none", "cyclic", "dihedral", "group", "revolution"]
+Axis = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """The proper symmetry of a part, in the part's own frame; all axes pass through its origin.
+
+    Args:
+        kind: ``none``; ``cyclic`` (``order`` turns about ``axis``); ``dihedral`` (the same, plus half
+            turns about ``flip_axis`` and its images); ``group`` (every element listed in
+            ``quaternions``, identity included); ``revolution`` (any turn about ``axis``).
+        axis: unit axis of the cyclic, dihedral and revolution kinds.
+        order: number of turns about ``axis`` for the cyclic and dihedral kinds.
+        flip: whether a body of revolution may also be turned over.
+        flip_axis: axis of one half turn of the dihedral kind, perpendicular to ``axis``.
+        quaternions: the elements of a ``group``.
+
+    Raises:
+        ValueError: with one sentence, when the arguments describe no group.
+    """
+
+    kind: Kind = "none"
+    axis: Axis = (0.0, 0.0, 1.0)
+    order: int = 1
+    flip: bool = False
+    flip_axis: Axis = (1.0, 0.0, 0.0)
+    quaternions: Sequence[Sequence[float]] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"symmetry kind must be one of {', '.join(get_args(Kind))}, got {self.kind!r}")
+        for name in ("axis", "flip_axis"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (3,) or not np.isfinite(value).all() or np.linalg.norm(value) < 1e-9:
+                raise ValueError(f"symmetry {name} must be three finite numbers, not all zero, got {getattr(self, name)}")
+            unit = value / np.linalg.norm(value)
+            object.__setattr__(self, name, (float(unit[0]), float(unit[1]), float(unit[2])))
+        if self.kind in ("cyclic", "dihedral") and self.order < 2:
+            raise ValueError(f"{self.kind} symmetry must have an order of at least 2, got {self.order}")
+        if self.kind == "dihedral" and abs(np.dot(self.axis, self.flip_axis)) > 1e-6:
+            raise ValueError(f"flip_axis must be perpendicular to axis, got {self.flip_axis} and {self.axis}")
+        object.__setattr__(self, "quaternions", tuple(tuple(float(v) for v in q) for q in self.quaternions))
+        if self.kind == "group":
+            self._check_group()
+
+    def _check_group(self) -> None:
+        if not self.quaternions or any(len(q) != 4 for q in self.quaternions):
+            raise ValueError("a group must list its elements as quaternions of four numbers (w, x, y, z)")
+        r = matrix_from_quaternion(self.quaternions)
+        products = np.einsum("aij,bjk->abik", r, r).reshape(-1, 9)
+        nearest = np.abs(products[:, None] - r.reshape(1, -1, 9)).max(-1).min(-1)
+        if nearest.max() > 1e-5:
+            raise ValueError("the product of two listed rotations must be listed too, or they form no group")
+
+    @property
+    def is_revolution(self) -> bool:
+        """Whether there is a continuum of symmetries."""
+        return self.kind == "revolution"
+
+    def rotations(self) -> NDArray[np.float64]:
+        """The elements ``(G, 3, 3)`` of the finite part of the group, identity first.
+
+        For a body of revolution: the identity and, with ``flip``, one half turn about a
+        perpendicular axis; the turns about ``axis`` are not enumerated.
+        """
+        if self.kind == "none":
+            return np.eye(3)[None]
+        if self.kind == "group":
+            r = matrix_from_quaternion(self.quaternions)
+            return r[np.argsort(np.abs(r - np.eye(3)).max((-2, -1)) > 1e-6, kind="stable")]
+        if self.kind == "revolution":
+            return np.stack([np.eye(3), rotation_about(self.perpendicular, np.pi)]) if self.flip else np.eye(3)[None]
+        turns = rotation_about(self.axis, 2 * np.pi * np.arange(self.order) / self.order)
+        if self.kind == "cyclic":
+            return turns
+        return np.concatenate([turns, turns @ rotation_about(self.flip_axis, np.pi)])
+
+    @property
+    def perpendicular(self) -> Axis:
+        """A unit axis perpendicular to ``axis``."""
+        a = np.asarray(self.axis)
+        other = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        other /= np.linalg.norm(other)
+        return float(other[0]), float(other[1]), float(other[2])
+
+    def frame(self) -> NDArray[np.float64]:
+        """Rotation ``(3, 3)`` whose third column is ``axis``: ``part_from_axis``, z along the axis."""
+        x = np.asarray(self.perpendicular)
+        z = np.asarray(self.axis)
+        return np.stack([x, np.cross(z, x), z], axis=-1)

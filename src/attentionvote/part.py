@@ -1,0 +1,93 @@
+"""A part: what the network looks for. Name, surface, diameter, symmetry, and its metric.
+
+The diameter is a constant of the part's configuration, because benchmarks define it differently
+(largest vertex distance, centroid sphere, bounding sphere); it is derived only for new parts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.geometry.symmetry import Symmetry
+
+
+def surface_moments(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[float, NDArray, NDArray]:
+    """Area (m^2), centroid ``(3,)`` and covariance ``(3, 3)`` of a triangle surface, exact integrals."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    total = float(area.sum())
+    centroid = (area[:, None] * (a + b + c) / 3).sum(0) / total
+    a, b, c = a - centroid, b - centroid, c - centroid
+    s = a + b + c
+    # Integral of x x^T over a triangle = area / 12 * (a a^T + b b^T + c c^T + s s^T).
+    second = sum(np.einsum("f,fi,fj->ij", area / 12, p, p) for p in (a, b, c, s))
+    return total, centroid, np.asarray(second) / total
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A rigid part.
+
+    Args:
+        name: stem of its configuration file.
+        vertices: ``(V, 3)`` metres, part frame.
+        faces: ``(F, 3)`` vertex indices, outward orientation.
+        diameter: D in metres, the unit of every threshold.
+        symmetry: proper symmetry in the part frame.
+        title: one line for people.
+
+    Raises:
+        ValueError: with one sentence, when the surface or the diameter is impossible.
+    """
+
+    name: str
+    vertices: NDArray[np.float64] = field(repr=False)
+    faces: NDArray[np.int64] = field(repr=False)
+    diameter: float
+    symmetry: Symmetry = field(default_factory=Symmetry)
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64)
+        if vertices.ndim != 2 or vertices.shape[-1] != 3 or len(vertices) < 4:
+            raise ValueError(f"{self.name}: vertices must be (V, 3) with V >= 4, got shape {vertices.shape}")
+        if faces.ndim != 2 or faces.shape[-1] != 3 or len(faces) < 4:
+            raise ValueError(f"{self.name}: faces must be (F, 3) with F >= 4, got shape {faces.shape}")
+        if not np.isfinite(vertices).all():
+            raise ValueError(f"{self.name}: vertices must be finite, got {int((~np.isfinite(vertices)).sum())} NaN or inf")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise ValueError(f"{self.name}: faces must index {len(vertices)} vertices, got {faces.min()}..{faces.max()}")
+        if not (np.isfinite(self.diameter) and self.diameter > 0):
+            raise ValueError(f"{self.name}: diameter must be positive metres, got {self.diameter}")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @cached_property
+    def covariance_root(self) -> NDArray[np.float64]:
+        """Lambda ``(3, 3)`` in metres: matrix root of the surface covariance (Bregier et al. 2017)."""
+        values, vectors = np.linalg.eigh(surface_moments(self.vertices, self.faces)[2])
+        return (vectors * np.sqrt(np.clip(values, 0, None))) @ vectors.T
+
+    @cached_property
+    def digest(self) -> str:
+        """Sha256 of what the part is: surface (to 1 nm), diameter and symmetry, not its name."""
+        h = hashlib.sha256()
+        h.update(np.round(self.vertices * 1e9).astype(np.int64).tobytes())
+        h.update(self.faces.tobytes())
+        h.update(repr((round(self.diameter * 1e9), self.symmetry)).encode())
+        return h.hexdigest()
+
+    def surface_points(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """``(count, 3)`` points uniform on the surface, part frame, metres."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        index = rng.choice(len(area), size=count, p=area / area.sum())
+        u, v = rng.random((2, count, 1))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        return a[index] + u * (b[index] - a[index]) + v * (c[index] - a[index])
