@@ -1,0 +1,24 @@
+"""Parts, scenes and sensors: everything that makes training data.
+
+The public names are loaded on first use, so that reading a part does not import the physics engine.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_MODULE_OF = {
+    "BUILTIN_PARTS": "cad",
+    "builtin_surface": "cad",
+    "largest_vertex_distance": "mesh",
+    "load_surface": "mesh",
+    "load_part": "part_files",
+    # scenes helper: add lines here
+}
+
+__all__ = sorted(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

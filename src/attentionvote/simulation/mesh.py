@@ -1,0 +1,118 @@
+"""Surfaces from files: read, converted to metres, and checked before anything is built on them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist
+
+METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+FORMATS = (".stl", ".obj", ".ply", ".glb")
+SMALLEST_EXTENT, LARGEST_EXTENT = 0.001, 5.0
+
+
+def load_surface(path: str | Path, units: str = "m") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices ``(V, 3)`` in metres and outward faces ``(F, 3)`` of a mesh file, in the file's frame.
+
+    Duplicate vertices are merged first (STL has no shared ones). A surface that is closed but inside out
+    is turned; everything else that is wrong is refused.
+
+    Args:
+        path: an STL, OBJ, PLY or GLB file; several bodies of one file are joined.
+        units: unit of the file's numbers: m, cm, mm or inch (STL and OBJ do not say).
+
+    Raises:
+        FileNotFoundError: when there is no such file.
+        ValueError: with one sentence, when it is no readable, finite, watertight, consistently oriented
+            solid of plausible size.
+    """
+    path = Path(path)
+    if units not in METRES_PER_UNIT:
+        raise ValueError(f"units must be one of {', '.join(METRES_PER_UNIT)}, got {units!r}")
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(f"mesh file must end in one of {', '.join(FORMATS)}, got '{path.name}'")
+    if not path.is_file():
+        raise FileNotFoundError(f"mesh file '{path}' does not exist")
+    mesh = _read(path)
+    mesh.apply_scale(METRES_PER_UNIT[units])
+    if not np.isfinite(mesh.vertices).all():
+        raise ValueError(
+            f"mesh '{path.name}' must have finite vertices, got {(~np.isfinite(mesh.vertices)).sum()} NaN or inf"
+        )
+    check_size(mesh.extents, units, path.name)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    _check_solid(mesh, path.name)
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def check_size(extents: NDArray[np.float64], units: str, name: str) -> None:
+    """Refuse a part larger than 5 m or smaller than 1 mm: its units are almost surely wrong.
+
+    Raises:
+        ValueError: naming the units that would give a plausible size.
+    """
+    largest = float(extents.max())
+    if SMALLEST_EXTENT <= largest <= LARGEST_EXTENT:
+        return
+    size_of = {u: largest / METRES_PER_UNIT[units] * METRES_PER_UNIT[u] for u in METRES_PER_UNIT}
+    # The best guess is the unit that brings the part nearest to a hand's width (geometric mean of the limits).
+    best = min(size_of, key=lambda u: abs(np.log(size_of[u] / 0.1)))
+    advice = (
+        f"try units={best} ({size_of[best]:.4g} m)"
+        if SMALLEST_EXTENT <= size_of[best] <= LARGEST_EXTENT
+        else f"no unit of {', '.join(METRES_PER_UNIT)} makes it plausible"
+    )
+    raise ValueError(
+        f"mesh '{name}' must be between 1 mm and 5 m long, got {largest:.4g} m with units={units}; {advice}"
+    )
+
+
+def largest_vertex_distance(vertices: NDArray[np.float64]) -> float:
+    """Largest distance between two of the vertices ``(V, 3)``: the diameter as BOP defines it."""
+    try:
+        corners = vertices[ConvexHull(vertices).vertices]
+    except QhullError:  # flat or tiny: no hull, all pairs
+        corners = vertices
+    if len(corners) <= 3000:
+        return float(pdist(corners).max())
+    return max(float(np.linalg.norm(corners - c, axis=1).max()) for c in corners)
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    try:
+        mesh = trimesh.load_mesh(path)
+        if isinstance(mesh, trimesh.Scene):
+            mesh = mesh.to_mesh()
+    except Exception as error:  # the readers raise whatever their parser does
+        raise ValueError(f"mesh '{path.name}' could not be read as {path.suffix[1:].upper()}: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) < 4:
+        count = len(mesh.faces) if isinstance(mesh, trimesh.Trimesh) else 0
+        raise ValueError(f"mesh '{path.name}' must hold a surface of at least 4 triangles, got {count}")
+    return mesh
+
+
+def _check_solid(mesh: trimesh.Trimesh, name: str) -> None:
+    if len(mesh.faces) < 4:
+        raise ValueError(f"mesh '{name}' must hold at least 4 triangles of non-zero area, got {len(mesh.faces)}")
+    uses = np.bincount(mesh.edges_unique_inverse)
+    if (uses != 2).any():
+        raise ValueError(
+            f"mesh '{name}' must be watertight, got {int((uses == 1).sum())} open edges and "
+            f"{int((uses > 2).sum())} edges of more than two faces; close it in the CAD program and export it again"
+        )
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+        if not mesh.is_winding_consistent:
+            raise ValueError(
+                f"mesh '{name}' must have faces of consistent orientation, got a surface with one side only"
+            )
+    if mesh.volume < 0:
+        mesh.invert()
+    if not mesh.volume > 1e-6 * float(mesh.extents.max()) ** 3:
+        raise ValueError(f"mesh '{name}' must enclose a volume, got {mesh.volume:.3g} m^3")

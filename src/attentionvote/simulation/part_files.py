@@ -1,0 +1,71 @@
+"""Parts by name: a built-in of the catalogue, or the user's mesh file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.part import Part
+from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
+from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
+
+BUILTIN = "builtin:"
+
+
+def load_part(
+    name: str,
+    mesh: str,
+    diameter: float | None = None,
+    units: str = "m",
+    symmetry: Mapping[str, Any] | Symmetry | None = None,
+    title: str = "",
+    base_radius: float | None = None,
+    voxel_size: float | None = None,
+) -> Part:
+    """The part that ``conf/object/NAME.yaml`` describes.
+
+    Args:
+        name: stem of the configuration file.
+        mesh: ``builtin:NAME`` of the catalogue, or the path of a mesh file in the part frame.
+        diameter: D in metres; left out, the built-in's, or the largest vertex distance of the file.
+        units: unit of the file's numbers (m, cm, mm, inch).
+        symmetry: proper symmetry in the part frame; left out, the built-in's, or none.
+        title: one line for people.
+        base_radius: override of a scale setting in metres; read by the pipelines, not used here.
+        voxel_size: the same for the voxel size.
+
+    Raises:
+        ValueError: with one sentence, on an unknown built-in, a broken mesh or an impossible symmetry.
+        FileNotFoundError: when the mesh file is missing; the sentence says where it comes from.
+    """
+    for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size), ("diameter", diameter)):
+        if value is not None and not 0 < value < 10:
+            raise ValueError(f"{name}: {key} must be positive metres (below 10) or null, got {value}")
+    group = _symmetry(name, symmetry)
+    if mesh.startswith(BUILTIN):
+        key = mesh.removeprefix(BUILTIN)
+        vertices, faces = builtin_surface(key)
+        entry = BUILTIN_PARTS[key]
+        return Part(
+            name, vertices, faces, diameter or entry.diameter, entry.symmetry if group is None else group,
+            title or entry.title,
+        )  # fmt: skip
+    if not Path(mesh).is_file():
+        raise FileNotFoundError(
+            f"mesh of object '{name}', {title or name}, must be at '{mesh}', which does not exist: put the file there"
+            " (a dataset's mesh comes with the dataset), or set ATTENTIONVOTE_DATA or object.mesh to where you have it"
+        )
+    vertices, faces = load_surface(mesh, units)
+    return Part(name, vertices, faces, diameter or largest_vertex_distance(vertices), group or Symmetry(), title)
+
+
+def _symmetry(name: str, symmetry: Mapping[str, Any] | Symmetry | None) -> Symmetry | None:
+    if symmetry is None or isinstance(symmetry, Symmetry):
+        return symmetry
+    known = set(Symmetry.__dataclass_fields__)
+    unknown = sorted(set(symmetry) - known)
+    if unknown:
+        raise ValueError(f"{name}: symmetry must only have the keys {', '.join(sorted(known))}, got '{unknown[0]}'")
+    return Symmetry(**dict(symmetry))
