@@ -1,0 +1,87 @@
+"""From depth to the network's input: back-projection, normals, sampling. One code for training and cell.
+
+Training on normals of another estimator than the cell's would be training on another sensor (14 degrees apart
+on average between ray-cast and PCA normals), so both sides call ``estimate_normals``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+NORMAL_NEIGHBORS = 30
+
+
+def back_project(
+    depth: NDArray[np.floating], fx: float, fy: float, cx: float, cy: float
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Points ``(P, 3)`` in the camera frame of a depth image and the flat pixel index ``(P,)`` of each.
+
+    Args:
+        depth: ``(H, W)`` metres along the optical axis; 0 and non-finite values are missing.
+        fx, fy, cx, cy: pinhole intrinsics in pixels, pixel centres at whole numbers.
+
+    Raises:
+        ValueError: when the image is not two-dimensional, has negative depth, or the focal length is not positive.
+    """
+    if depth.ndim != 2:
+        raise ValueError(f"depth must be an image (H, W), got shape {depth.shape}")
+    if not (fx > 0 and fy > 0):
+        raise ValueError(f"focal lengths must be positive pixels, got fx {fx} and fy {fy}")
+    valid = np.isfinite(depth)
+    if (depth[valid] < 0).any():
+        raise ValueError(f"depth must not be negative, got {float(depth[valid].min()):.4g} m as its minimum")
+    pixels = np.flatnonzero(valid & (depth > 0))
+    z = depth.reshape(-1)[pixels].astype(np.float64)
+    v, u = np.divmod(pixels, depth.shape[1])
+    points = np.stack([(u - cx) * z / fx, (v - cy) * z / fy, z], axis=-1)
+    return points.astype(np.float32), pixels
+
+
+def estimate_normals(
+    points: NDArray[np.float32], query: NDArray[np.float32] | None = None, neighbors: int = NORMAL_NEIGHBORS
+) -> NDArray[np.float32]:
+    """Unit normals ``(Q, 3)`` by principal component analysis, turned towards the camera at the origin.
+
+    The direction of least variance of the ``neighbors`` nearest points (the point itself included), as Open3D
+    does (paper section 3.5). The neighbours come from the whole cloud even when only a sample of it is asked
+    for: a denser cloud gives better normals at the same cost per asked point.
+
+    Args:
+        points: ``(P, 3)`` metres, camera frame, the densest cloud at hand.
+        query: ``(Q, 3)`` where normals are wanted; all points when None.
+        neighbors: size of the neighbourhood; all points when there are fewer.
+
+    Raises:
+        ValueError: when there are fewer than three points or any is not finite.
+    """
+    asked = points if query is None else query
+    for name, value in (("points", points), ("query", asked)):
+        if value.ndim != 2 or value.shape[1] != 3:
+            raise ValueError(f"{name} must have shape (P, 3), got {value.shape}")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, got {int((~np.isfinite(value)).any(axis=1).sum())} with NaN or inf")
+    if len(points) < 3:
+        raise ValueError(f"normals need at least 3 points, got {len(points)}")
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False, leafsize=32)
+    _, index = tree.query(asked, k=min(neighbors, len(points)))
+    near = points.astype(np.float64)[index]
+    near -= near.mean(axis=1, keepdims=True)
+    covariance = np.einsum("qki,qkj->qij", near, near, optimize=True)
+    normals = np.linalg.eigh(covariance)[1][:, :, 0]
+    away = np.einsum("qi,qi->q", normals, asked) > 0
+    return np.where(away[:, None], -normals, normals).astype(np.float32)
+
+
+def sample_indices(available: int, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """``count`` random indices below ``available``: without repetition, or with it when there are too few.
+
+    Raises:
+        ValueError: when there is nothing to choose from.
+    """
+    if available < 1:
+        raise ValueError("cannot sample from an empty cloud: 0 points available")
+    if available >= count:
+        return rng.permutation(available)[:count]
+    return np.concatenate([rng.permutation(available), rng.integers(0, available, count - available)])

@@ -1,0 +1,254 @@
+/* Point operators of attentionvote: exact farthest-point order, first-k ball query, nearest neighbours.
+ *
+ * Plain C99, no dependency, called through ctypes (geometry/sampling.py), which also holds the slow numpy
+ * references that the tests compare with. Compile with -O3 -ffinite-math-only -fno-signed-zeros: the running
+ * maximum vectorises only then. Never with -ffast-math: linked into a shared object it makes GCC flush
+ * subnormals to zero in the whole process.
+ */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define BLOCK 64
+#define MAX_CELLS_PER_AXIS 1024
+
+typedef struct {
+    uint64_t key;
+    int32_t index;
+} keyed;
+
+static int by_key(const void *a, const void *b) {
+    const keyed *x = a, *y = b;
+    if (x->key != y->key) return x->key < y->key ? -1 : 1;
+    return x->index < y->index ? -1 : (x->index > y->index);
+}
+
+static uint64_t spread(uint64_t v) { /* 21 bits, two zero bits between neighbours */
+    v &= 0x1fffff;
+    v = (v | v << 32) & 0x1f00000000ffffULL;
+    v = (v | v << 16) & 0x1f0000ff0000ffULL;
+    v = (v | v << 8) & 0x100f00f00f00f00fULL;
+    v = (v | v << 4) & 0x10c30c30c30c30c3ULL;
+    v = (v | v << 2) & 0x1249249249249249ULL;
+    return v;
+}
+
+/* Farthest-point order: order[0] = 0, then always the point farthest from all chosen ones, ties to the lowest
+ * index. Points are sorted along a Morton curve into blocks with bounding boxes; a block is visited only when
+ * the new sample can be nearer than the block's current maximum. Returns 0, or 1 when memory runs out. */
+int farthest_point_order(const float *xyz, int32_t n, int32_t m, int32_t *order) {
+    const int32_t blocks = (n + BLOCK - 1) / BLOCK, padded = blocks * BLOCK;
+    keyed *keys = malloc(sizeof(keyed) * (size_t)n);
+    float *soa = malloc(sizeof(float) * 4 * (size_t)padded);
+    int32_t *original = malloc(sizeof(int32_t) * (size_t)padded);
+    float *box = malloc(sizeof(float) * 7 * (size_t)blocks);
+    int32_t *best = malloc(sizeof(int32_t) * (size_t)blocks);
+    if (!keys || !soa || !original || !box || !best) {
+        free(keys), free(soa), free(original), free(box), free(best);
+        return 1;
+    }
+    float low[3], high[3];
+    for (int a = 0; a < 3; a++) low[a] = high[a] = xyz[a];
+    for (int32_t i = 0; i < n; i++)
+        for (int a = 0; a < 3; a++) {
+            const float v = xyz[3 * i + a];
+            if (v < low[a]) low[a] = v;
+            if (v > high[a]) high[a] = v;
+        }
+    float extent = 1e-12f;
+    for (int a = 0; a < 3; a++)
+        if (high[a] - low[a] > extent) extent = high[a] - low[a];
+    for (int32_t i = 0; i < n; i++) {
+        uint64_t key = 0;
+        for (int a = 0; a < 3; a++) key |= spread((uint64_t)((xyz[3 * i + a] - low[a]) / extent * 127.0f)) << a;
+        keys[i].key = key;
+        keys[i].index = i;
+    }
+    qsort(keys, (size_t)n, sizeof(keyed), by_key);
+    float *x = soa, *y = soa + padded, *z = soa + 2 * padded, *d = soa + 3 * padded;
+    for (int32_t i = 0; i < padded; i++) {
+        const int32_t j = keys[i < n ? i : n - 1].index;
+        x[i] = xyz[3 * j], y[i] = xyz[3 * j + 1], z[i] = xyz[3 * j + 2];
+        original[i] = j;
+        d[i] = i < n ? INFINITY : -1.0f; /* padding is never the farthest */
+    }
+    float *lx = box, *hx = box + blocks, *ly = box + 2 * blocks, *hy = box + 3 * blocks, *lz = box + 4 * blocks,
+          *hz = box + 5 * blocks, *farthest = box + 6 * blocks;
+    for (int32_t b = 0; b < blocks; b++) {
+        const int32_t s = b * BLOCK;
+        lx[b] = hx[b] = x[s], ly[b] = hy[b] = y[s], lz[b] = hz[b] = z[s];
+        for (int32_t i = s; i < s + BLOCK; i++) {
+            lx[b] = x[i] < lx[b] ? x[i] : lx[b], hx[b] = x[i] > hx[b] ? x[i] : hx[b];
+            ly[b] = y[i] < ly[b] ? y[i] : ly[b], hy[b] = y[i] > hy[b] ? y[i] : hy[b];
+            lz[b] = z[i] < lz[b] ? z[i] : lz[b], hz[b] = z[i] > hz[b] ? z[i] : hz[b];
+        }
+        farthest[b] = INFINITY;
+        best[b] = s;
+    }
+    int32_t chosen = 0;
+    for (int32_t step = 0; step < m; step++) {
+        order[step] = chosen;
+        const float px = xyz[3 * chosen], py = xyz[3 * chosen + 1], pz = xyz[3 * chosen + 2];
+        for (int32_t b = 0; b < blocks; b++) {
+            float dx = px < lx[b] ? lx[b] - px : (px > hx[b] ? px - hx[b] : 0.0f);
+            float dy = py < ly[b] ? ly[b] - py : (py > hy[b] ? py - hy[b] : 0.0f);
+            float dz = pz < lz[b] ? lz[b] - pz : (pz > hz[b] ? pz - hz[b] : 0.0f);
+            /* The slack covers rounding of the bound, so that pruning never changes the result. */
+            if ((dx * dx + dy * dy + dz * dz) * 0.99999f >= farthest[b]) continue;
+            const int32_t s = b * BLOCK;
+            float top = -1.0f;
+            for (int32_t i = s; i < s + BLOCK; i++) {
+                const float ex = x[i] - px, ey = y[i] - py, ez = z[i] - pz;
+                const float e = ex * ex + ey * ey + ez * ez;
+                d[i] = d[i] < e ? d[i] : e;
+                top = top > d[i] ? top : d[i];
+            }
+            farthest[b] = top;
+            int32_t winner = s;
+            int32_t lowest = INT32_MAX;
+            for (int32_t i = s; i < s + BLOCK; i++)
+                if (d[i] == top && original[i] < lowest) lowest = original[i], winner = i;
+            best[b] = winner;
+        }
+        float top = -2.0f;
+        for (int32_t b = 0; b < blocks; b++) top = top > farthest[b] ? top : farthest[b];
+        int32_t lowest = INT32_MAX;
+        for (int32_t b = 0; b < blocks; b++)
+            if (farthest[b] == top && original[best[b]] < lowest) lowest = original[best[b]];
+        chosen = lowest;
+    }
+    free(keys), free(soa), free(original), free(box), free(best);
+    return 0;
+}
+
+static int ascending(const void *a, const void *b) {
+    const int32_t x = *(const int32_t *)a, y = *(const int32_t *)b;
+    return x < y ? -1 : (x > y);
+}
+
+static void keep_smallest(int32_t *v, int32_t n, int32_t k) { /* quickselect: the k smallest come first */
+    int32_t lo = 0, hi = n - 1;
+    while (lo < hi) {
+        const int32_t pivot = v[lo + (hi - lo) / 2];
+        int32_t i = lo, j = hi;
+        while (i <= j) {
+            while (v[i] < pivot) i++;
+            while (v[j] > pivot) j--;
+            if (i <= j) {
+                const int32_t t = v[i];
+                v[i++] = v[j], v[j--] = t;
+            }
+        }
+        if (k - 1 <= j) hi = j;
+        else if (k - 1 >= i) lo = i;
+        else return;
+    }
+}
+
+/* For every centre the first k points in index order with distance <= radius, padded with the first; counts[c]
+ * is the number of real neighbours (at most k). An empty ball has count 0 and index 0. */
+int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, float radius, int32_t k,
+               int32_t *neighbors, int32_t *counts) {
+    float low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
+    for (int a = 0; a < 3 && n > 0; a++) low[a] = high[a] = xyz[a];
+    for (int32_t i = 0; i < n; i++)
+        for (int a = 0; a < 3; a++) {
+            const float v = xyz[3 * i + a];
+            if (v < low[a]) low[a] = v;
+            if (v > high[a]) high[a] = v;
+        }
+    float cell = radius;
+    int64_t cells[3], total;
+    for (;;) { /* a coarser cell is only slower, never wrong */
+        total = 1;
+        int fits = 1;
+        for (int a = 0; a < 3; a++) {
+            const double count = floor((double)(high[a] - low[a]) / cell) + 1;
+            if (count > MAX_CELLS_PER_AXIS) fits = 0;
+            cells[a] = count > MAX_CELLS_PER_AXIS ? MAX_CELLS_PER_AXIS : (int64_t)count;
+            total *= cells[a];
+        }
+        if (fits && total <= 8 * (int64_t)n + 64) break;
+        cell *= 1.5f;
+    }
+    int32_t *start = calloc((size_t)total + 2, sizeof(int32_t));
+    int32_t *cell_of = malloc(sizeof(int32_t) * ((size_t)n + 1));
+    int32_t *sorted = malloc(sizeof(int32_t) * ((size_t)n + 1));
+    float *packed = malloc(sizeof(float) * 3 * ((size_t)n + 1));
+    int32_t *found = malloc(sizeof(int32_t) * ((size_t)n + 1));
+    if (!start || !cell_of || !sorted || !packed || !found) {
+        free(start), free(cell_of), free(sorted), free(packed), free(found);
+        return 1;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        int64_t c[3];
+        for (int a = 0; a < 3; a++) {
+            c[a] = (int64_t)((xyz[3 * i + a] - low[a]) / cell);
+            if (c[a] >= cells[a]) c[a] = cells[a] - 1;
+        }
+        cell_of[i] = (int32_t)((c[2] * cells[1] + c[1]) * cells[0] + c[0]);
+        start[cell_of[i] + 2]++;
+    }
+    for (int64_t c = 0; c < total; c++) start[c + 2] += start[c + 1];
+    for (int32_t i = 0; i < n; i++) {
+        const int32_t slot = start[cell_of[i] + 1]++;
+        sorted[slot] = i;
+        for (int a = 0; a < 3; a++) packed[3 * slot + a] = xyz[3 * i + a];
+    }
+    const float squared = radius * radius;
+    for (int32_t q = 0; q < m; q++) {
+        const float *p = centers + 3 * q;
+        int64_t from[3], to[3];
+        for (int a = 0; a < 3; a++) {
+            /* One cell of slack: rounding must not lose a point on the border. */
+            from[a] = (int64_t)floorf((p[a] - radius - low[a]) / cell * 0.999999f) - (p[a] - radius < low[a] ? 1 : 0);
+            to[a] = (int64_t)floorf((p[a] + radius - low[a]) / cell * 1.000001f);
+            if (from[a] < 0) from[a] = 0;
+            if (to[a] >= cells[a]) to[a] = cells[a] - 1;
+        }
+        int32_t count = 0;
+        for (int64_t cz = from[2]; cz <= to[2]; cz++)
+            for (int64_t cy = from[1]; cy <= to[1]; cy++) {
+                if (from[0] > to[0]) continue;
+                const int64_t row = (cz * cells[1] + cy) * cells[0];
+                const int32_t end = start[row + to[0] + 1];
+                for (int32_t s = start[row + from[0]]; s < end; s++) {
+                    const float dx = packed[3 * s] - p[0], dy = packed[3 * s + 1] - p[1], dz = packed[3 * s + 2] - p[2];
+                    found[count] = sorted[s];
+                    count += dx * dx + dy * dy + dz * dz <= squared;
+                }
+            }
+        int32_t *out = neighbors + (int64_t)q * k;
+        if (count > k) keep_smallest(found, count, k);
+        counts[q] = count < k ? count : k;
+        qsort(found, (size_t)counts[q], sizeof(int32_t), ascending);
+        for (int32_t j = 0; j < k; j++) out[j] = counts[q] == 0 ? 0 : found[j < counts[q] ? j : 0];
+    }
+    free(start), free(cell_of), free(sorted), free(packed), free(found);
+    return 0;
+}
+
+/* The three nearest sources of every target with squared distances, nearest first, ties to the lower index;
+ * with fewer than three sources the last one is repeated. */
+int three_nearest(const float *sources, int32_t n, const float *targets, int32_t m, int32_t *neighbors,
+                  float *squared) {
+    for (int32_t t = 0; t < m; t++) {
+        float d[3] = {INFINITY, INFINITY, INFINITY};
+        int32_t at[3] = {0, 0, 0};
+        const float *p = targets + 3 * t;
+        for (int32_t i = 0; i < n; i++) {
+            const float dx = sources[3 * i] - p[0], dy = sources[3 * i + 1] - p[1], dz = sources[3 * i + 2] - p[2];
+            const float e = dx * dx + dy * dy + dz * dz;
+            if (e >= d[2]) continue;
+            if (e < d[0]) d[2] = d[1], at[2] = at[1], d[1] = d[0], at[1] = at[0], d[0] = e, at[0] = i;
+            else if (e < d[1]) d[2] = d[1], at[2] = at[1], d[1] = e, at[1] = i;
+            else d[2] = e, at[2] = i;
+        }
+        for (int32_t j = 1; j < 3; j++)
+            if (j >= n) d[j] = d[n - 1], at[j] = at[n - 1];
+        memcpy(squared + 3 * t, d, sizeof d);
+        memcpy(neighbors + 3 * t, at, sizeof at);
+    }
+    return 0;
+}
