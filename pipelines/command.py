@@ -1,0 +1,219 @@
+"""What every verb has in common: help, configuration, errors, exit codes, the line on stdout.
+
+A verb is a script ``pipelines/<verb>.py`` with a function ``run(cfg) -> dict``::
+
+    if __name__ == "__main__":
+        command("train", run)
+
+The dictionary is printed as the only line on stdout, one JSON object; everything else that is
+printed while the verb runs, by anybody, goes to stderr. Exit codes: 0 success, 2 impossible
+configuration (before any work), 130 interrupted, 1 anything else. Heavy imports belong inside ``run``, so that
+``--help`` and a misspelt word are answered at once.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+from configuration import CONF, ConfigurationError, choices, compose, leaves, sentence
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf
+
+__all__ = ["ConfigurationError", "command", "configuring"]
+
+Run = Callable[[DictConfig], dict[str, Any]]
+Defaults = Callable[[list[str]], list[str]]
+LOGS = Path("outputs/logs")
+
+
+def command(verb: str, run: Run, *, defaults: Defaults | None = None, conf: Path = CONF) -> NoReturn:
+    """Run a verb with the words of the command line and leave the process.
+
+    Args:
+        verb: stem of the script and of its primary configuration file.
+        run: does the work; its dictionary becomes the JSON line.
+        defaults: given the user's words, further overrides that stand for the machine's default
+            (they come first, so the user's words win).
+        conf: folder of the configuration files.
+    """
+    words = sys.argv[1:]
+    _log_to_stderr()
+    if any(word in ("-h", "--help") for word in words):
+        print(_help(verb, conf))
+        sys.exit(0)
+    with _one_sentence(verb):
+        if defaults is not None:
+            words = [*defaults([w for w in words if not w.startswith("-")]), *words]
+        overrides = [word for word in words if not word.startswith("-")]
+        if len(overrides) == len(words):
+            _print_result(run, compose(verb, overrides, conf))
+        else:
+            _with_hydra(verb, run, words, overrides, conf)
+    sys.exit(0)
+
+
+@contextmanager
+def configuring(what: str = "") -> Iterator[None]:
+    """Around code that only builds things from the configuration: its expected errors are configuration errors.
+
+    Args:
+        what: put in front of the sentence, e.g. ``object gear``.
+
+    Raises:
+        ConfigurationError: instead of ValueError, TypeError and OSError (a missing mesh, say).
+    """
+    try:
+        yield
+    except ConfigurationError:
+        raise
+    except InstantiationException as error:
+        cause = _root(error)
+        if isinstance(cause, (ValueError, TypeError, OSError, InstantiationException)):
+            raise ConfigurationError(_prefixed(what, cause)) from error
+        raise
+    except (ValueError, TypeError, OSError) as error:
+        raise ConfigurationError(_prefixed(what, error)) from error
+
+
+def _prefixed(what: str, error: BaseException) -> str:
+    return f"{what}: {sentence(error)}" if what else sentence(error)
+
+
+def _root(error: BaseException) -> BaseException:
+    while isinstance(error, InstantiationException) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def _print_result(run: Run, cfg: DictConfig) -> None:
+    """Run with file descriptor 1 pointing at stderr, so that the result is the only line on stdout."""
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        result = run(cfg)
+        sys.stdout.flush()
+    finally:
+        os.dup2(stdout, 1)
+        os.close(stdout)
+    print(json.dumps(result, default=_jsonable), flush=True)
+
+
+def _jsonable(value: Any) -> Any:
+    if hasattr(value, "tolist"):  # numpy and torch scalars and arrays
+        return value.tolist()
+    return str(value)
+
+
+def _with_hydra(verb: str, run: Run, words: Sequence[str], overrides: Sequence[str], conf: Path) -> None:
+    """Hydra's own flags (``--multirun``, ``--cfg job`` ...): every job of a grid is checked before the first starts."""
+    import hydra
+    from configuration import parse
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
+    if "-m" in words or "--multirun" in words:
+        grid = [o for o in parse(overrides) if not o.key_or_group.startswith("hydra")]
+        for job in BasicSweeper.split_arguments(grid, None)[0]:
+            compose(verb, job, conf)
+
+    def task(cfg: DictConfig) -> None:
+        with _one_sentence(verb):
+            OmegaConf.resolve(cfg)
+            _print_result(run, cfg)
+
+    own_defaults = {
+        "hydra.run.dir": ".",
+        "hydra.output_subdir": "null",
+        "hydra.sweep.dir": f"outputs/multirun/{time.strftime('%Y-%m-%d_%H-%M-%S')}",
+        "hydra/job_logging": "none",
+        "hydra/hydra_logging": "none",
+    }
+    given = {word.partition("=")[0] for word in words}
+    # argparse takes the overrides from one place only: ours go in front of the user's first.
+    place = next((i for i, word in enumerate(words) if "=" in word), len(words))
+    own = [f"{key}={value}" for key, value in own_defaults.items() if key not in given]
+    sys.argv = [sys.argv[0], *words[:place], *own, *words[place:]]
+    hydra.main(config_path=str(conf), config_name=verb, version_base="1.3")(task)()
+
+
+@contextmanager
+def _one_sentence(verb: str) -> Iterator[None]:
+    """Every exception becomes one sentence on stderr and an exit code."""
+    try:
+        yield
+    except ConfigurationError as error:
+        _leave(f"{verb}: {sentence(error)}", 2)
+    except InstantiationException as error:
+        cause = _root(error)
+        if isinstance(cause, (ValueError, TypeError, OSError, InstantiationException)):
+            _leave(f"{verb}: {sentence(cause)}", 2)
+        _leave(f"{verb}: {sentence(cause)} ({type(cause).__name__}, details in {_write_traceback(verb)})", 1)
+    except KeyboardInterrupt:
+        _leave(f"{verb}: interrupted; run the same command to resume", 130)
+    except SystemExit as error:
+        # Lightning answers Ctrl-C with exit(1) from inside its handler of the KeyboardInterrupt.
+        if isinstance(error.__context__, KeyboardInterrupt):
+            _leave(f"{verb}: interrupted; run the same command to resume", 130)
+        raise
+    except BaseException as error:
+        expected = isinstance(error, (ValueError, OSError))
+        kind = "" if expected else f"{type(error).__name__}: "
+        _leave(f"{verb}: {kind}{sentence(error)} (details in {_write_traceback(verb)})", 1)
+
+
+def _leave(message: str, code: int) -> NoReturn:
+    sys.stdout.flush()
+    print(message, file=sys.stderr, flush=True)
+    raise SystemExit(code) from None
+
+
+def _write_traceback(verb: str) -> Path:
+    LOGS.mkdir(parents=True, exist_ok=True)
+    path = LOGS / f"{verb}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.log"
+    path.write_text(f"{' '.join(sys.argv)}\n\n{traceback.format_exc()}", encoding="utf-8")
+    return path
+
+
+class _Plain(logging.Formatter):
+    """Information as it is, anything graver with its level in front."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return text if record.levelno <= logging.INFO else f"{record.levelname.lower()}: {text}"
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Plain("%(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    for name in ("attentionvote", "__main__"):
+        logging.getLogger(name).setLevel(logging.INFO)
+    logging.captureWarnings(True)
+
+
+def _help(verb: str, conf: Path) -> str:
+    """The script's docstring, the groups with their choices, and every setting with its default."""
+    lines = [(sys.modules["__main__"].__doc__ or verb).strip(), ""]
+    primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
+    assert isinstance(primary, dict)
+    chosen = [item for item in primary.get("defaults", []) if isinstance(item, dict)]
+    names = [str(key).removeprefix("override ").split("@")[0].strip("/") for item in chosen for key in item]
+    for group in [name for name in names if (conf / name).is_dir()]:
+        lines.append(f"  {group}=  {' | '.join(choices(group, conf))}")
+    mandatory = [f"{g}={choices(g, conf)[0]}" for i in chosen for g, v in i.items() if v == "???" and choices(g, conf)]
+    try:
+        settings = leaves(OmegaConf.to_container(compose(verb, mandatory, conf)))
+    except ConfigurationError:  # e.g. a mandatory setting: show what the file itself holds
+        settings = leaves({key: value for key, value in primary.items() if key != "defaults"})
+    lines += ["", "Settings (key=value) and their defaults:"]
+    lines += [f"  {key}={json.dumps(value)}" for key, value in settings if not key.startswith("hydra.")]
+    return "\n".join([*lines, "", "A comma-separated list of values with -m runs a grid (Hydra's multirun)."])

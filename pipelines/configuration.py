@@ -1,0 +1,227 @@
+"""From ``conf/`` and the words on the command line to one checked configuration.
+
+Hydra composes; this module turns everything that can be wrong with the result into one sentence
+with the nearest valid name, before any work starts:
+
+* a group choice that does not exist (``object=conecting_rod``) or a group that must be chosen;
+* a setting that does not exist (``trainer.max_epoch=3``, ``lr=1``);
+* a value of another type than the default it replaces (``trainer.lr=abc``);
+* a value outside its range (``pipelines/schema.py``);
+* an interpolation or a mandatory value that cannot be resolved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from schema import violation
+from yaml import YAMLError
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+
+
+class ConfigurationError(ValueError):
+    """What the user asked for is impossible; the message is one sentence. Ends a verb with exit code 2."""
+
+
+def sentence(error: BaseException) -> str:
+    """The message of ``error`` on one line, or the name of its class when it has none."""
+    if isinstance(error, FileNotFoundError) and error.filename is not None:
+        return f"file not found: {error.filename}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """The end of a sentence, ``, did you mean 'x'?``, or nothing when no valid name is near."""
+    names = list(valid)
+    by_leaf = [v for v in names if v.rpartition(".")[2] == name.rpartition(".")[2]]
+    close = by_leaf or get_close_matches(name, names, n=1, cutoff=0.6)
+    if not close:
+        leaves = {v.rpartition(".")[2]: v for v in reversed(names)}
+        close = [leaves[leaf] for leaf in get_close_matches(name.rpartition(".")[2], leaves, n=1, cutoff=0.7)]
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def choices(group: str, conf: Path = CONF) -> list[str]:
+    """The names that may be chosen for a group, sorted."""
+    return sorted(p.stem for p in (conf / group).glob("*.yaml"))
+
+
+def groups(conf: Path = CONF) -> list[str]:
+    """Every group, as ``a`` or ``a/b``."""
+    return sorted(p.relative_to(conf).as_posix() for p in conf.rglob("*") if p.is_dir() and any(p.glob("*.yaml")))
+
+
+def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every dotted key below ``node`` (plain containers) with its value; empty mappings count as values."""
+    if isinstance(node, Mapping) and node:
+        for key, value in node.items():
+            yield from leaves(value, f"{prefix}.{key}" if prefix else str(key))
+    elif prefix:
+        yield prefix, node
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """The words after the verb, parsed by Hydra's grammar.
+
+    Raises:
+        ConfigurationError: on a word that is no ``key=value``.
+    """
+    parsed = []
+    for word in overrides:
+        try:
+            parsed.append(OverridesParser.create().parse_override(word))
+        except (OverrideParseException, HydraException) as error:
+            raise ConfigurationError(f"every argument must be key=value, got {word!r}") from error
+    return parsed
+
+
+def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfig:
+    """The checked configuration of ``conf/<verb>.yaml`` with ``overrides``, every interpolation resolved.
+
+    Raises:
+        ConfigurationError: with one sentence, see the module's docstring.
+    """
+    parsed = parse(overrides)
+    chosen = [o for o in parsed if o.input_line and (conf / o.key_or_group).is_dir()]
+    for override in chosen:
+        _check_choice(override, conf)
+    hydra_own = [o.input_line for o in parsed if o.input_line and o.key_or_group.split("/")[0].split(".")[0] == "hydra"]
+    base = _plain(_compose(verb, [*(str(o.input_line) for o in chosen), *(str(w) for w in hydra_own)], conf))
+    values = [o for o in parsed if o not in chosen and o.input_line not in hydra_own]
+    for override in values:
+        _check_key(override, base, conf)
+    cfg = _compose(verb, overrides, conf)
+    final = _plain(cfg)
+    for override in values:
+        if not (override.is_add() or override.is_delete()):
+            _check_types(
+                override.key_or_group, _select(base, override.key_or_group), _select(final, override.key_or_group)
+            )
+    for key, value in leaves(final):
+        problem = violation(key, value)
+        if problem:
+            raise ConfigurationError(problem)
+    OmegaConf.resolve(cfg)
+    return cfg
+
+
+def _compose(verb: str, overrides: Sequence[str], conf: Path) -> DictConfig:
+    try:
+        with initialize_config_dir(str(conf), version_base="1.3", job_name=verb):
+            return hydra_compose(verb, list(overrides))
+    except MissingConfigException as error:
+        group, _, name = (error.missing_cfg_file or "").rpartition("/")
+        if group and (conf / group).is_dir():
+            raise ConfigurationError(_choice_problem(group, name, conf)) from error
+        raise ConfigurationError(sentence(error).split(" Config search path")[0]) from error
+    except ConfigCompositionException as error:
+        text = sentence(error)
+        if text.startswith("You must specify"):
+            group = text.split("'")[1]
+            raise ConfigurationError(f"{group} must be given, one of {', '.join(choices(group, conf))}") from error
+        raise ConfigurationError(text) from error
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigurationError(sentence(error)) from error
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    try:
+        missing = sorted(OmegaConf.missing_keys(cfg))
+        plain = OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException as error:
+        reason = sentence(error).split(" full_key")[0]
+        raise ConfigurationError(f"{getattr(error, 'full_key', None)} cannot be resolved: {reason}") from error
+    if missing:
+        raise ConfigurationError(f"{missing[0]} must be given, e.g. {missing[0]}=VALUE")
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def _choice_problem(group: str, name: str, conf: Path) -> str:
+    valid = choices(group, conf)
+    return f"{group} must be one of {', '.join(valid)}; got {name!r}{nearest(name, valid)}"
+
+
+def _check_choice(override: Override, conf: Path) -> None:
+    if override.is_sweep_override():
+        raise ConfigurationError(f"{override.input_line} lists several choices, which needs -m (a grid of runs)")
+    if override.is_delete():
+        return
+    value = override.value()
+    for name in value if isinstance(value, list) else [value]:
+        if str(name) not in choices(override.key_or_group, conf):
+            shown = "null" if name is None else str(name)
+            raise ConfigurationError(_choice_problem(override.key_or_group, shown, conf))
+
+
+def _check_key(override: Override, base: dict[str, Any], conf: Path) -> None:
+    key = override.key_or_group
+    if override.is_add():
+        return
+    try:
+        _select(base, key)
+    except KeyError:
+        known = [k for k, _ in leaves(base)]
+        sections = {k.rsplit(".", n)[0] for k in known for n in range(1, k.count(".") + 1)}
+        hint = nearest(key, [*(g for g in groups(conf) if "." not in key), *known, *sorted(sections)])
+        raise ConfigurationError(f"there is no setting {key!r}{hint}") from None
+
+
+def _select(plain: Any, key: str) -> Any:
+    node = plain
+    for name in key.split("."):
+        if isinstance(node, list) and name.isdigit() and int(name) < len(node):
+            node = node[int(name)]
+        elif isinstance(node, Mapping) and name in node:
+            node = node[name]
+        else:
+            raise KeyError(key)
+    return node
+
+
+def _check_types(key: str, default: Any, value: Any) -> None:
+    """Refuse ``value`` where it has another type than ``default``; null as a default accepts anything."""
+    if default is None:
+        return
+    if isinstance(default, Mapping):
+        if not isinstance(value, Mapping):
+            raise ConfigurationError(f"{key} must be a section with keys {', '.join(map(str, default))}; got {value!r}")
+        for name in value:
+            if name in default:
+                _check_types(f"{key}.{name}", default[name], value[name])
+        return
+    if isinstance(default, list):
+        if not isinstance(value, list):
+            raise ConfigurationError(f"{key} must be a list such as {default}; got {value!r}")
+        for index, item in enumerate(value if default else ()):
+            _check_types(f"{key}[{index}]", default[min(index, len(default) - 1)], item)
+        return
+    problem = type_problem(default, value)
+    if problem:
+        raise ConfigurationError(
+            f"{key} must be {problem} such as {default}; got {'null' if value is None else repr(value)}"
+        )
+
+
+def type_problem(default: object, value: object) -> str:
+    """What ``value`` should have been to replace ``default``, or an empty string when it fits."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(default, bool):
+        return "" if isinstance(value, bool) else "true or false,"
+    if isinstance(default, int):
+        return "" if number and not isinstance(value, float) else "a whole number"
+    if isinstance(default, float):
+        return "" if number and math.isfinite(float(value)) else "a finite number"  # type: ignore[arg-type]
+    return "" if isinstance(value, str) or number or isinstance(value, bool) else "a text"
