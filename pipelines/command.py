@@ -207,8 +207,7 @@ def _help(verb: str, conf: Path) -> str:
     assert isinstance(primary, dict)
     chosen = [item for item in primary.get("defaults", []) if isinstance(item, dict)]
     names = [str(key).removeprefix("override ").split("@")[0].strip("/") for item in chosen for key in item]
-    for group in [name for name in names if (conf / name).is_dir()]:
-        lines.append(f"  {group}=  {' | '.join(choices(group, conf))}")
+    lines += [f"  {name}=  {' | '.join(choices(name, conf))}" for name in names if (conf / name).is_dir()]
     mandatory = [f"{g}={choices(g, conf)[0]}" for i in chosen for g, v in i.items() if v == "???" and choices(g, conf)]
     try:
         settings = leaves(OmegaConf.to_container(compose(verb, mandatory, conf)))

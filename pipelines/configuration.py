@@ -26,7 +26,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from schema import violation
-from yaml import YAMLError
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
