@@ -1,0 +1,41 @@
+"""How good a detector is: pose distances, matching, average precision, ADD, recall by visibility.
+
+Numpy and scipy only. Definitions follow the toolbox of Bregier et al. (2017).
+"""
+
+from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
+from attentionvote.evaluation.average_precision import DetectionScores, average_precision
+from attentionvote.evaluation.matching import Matching, ScoreCurve, match, score_curve
+from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
+from attentionvote.evaluation.result_files import (
+    read_ground_truth,
+    read_results,
+    read_scene_results,
+    write_ground_truth,
+    write_results,
+)
+from attentionvote.evaluation.scene_result import Distance, SceneResult
+from attentionvote.evaluation.scores import Curves, curves, evaluate
+
+__all__ = [
+    "AverageDistance",
+    "Curves",
+    "DetectionScores",
+    "Distance",
+    "Matching",
+    "NearestPointDistance",
+    "PoseMetric",
+    "SceneResult",
+    "ScoreCurve",
+    "average_precision",
+    "curves",
+    "evaluate",
+    "match",
+    "read_ground_truth",
+    "read_results",
+    "read_scene_results",
+    "rotation_errors",
+    "score_curve",
+    "write_ground_truth",
+    "write_results",
+]

@@ -1,0 +1,155 @@
+"""Ground-truth and result files in the Sileane layout (JSON, metres).
+
+One file a scene, ``NAME.json``: ground truth is a list of ``{"R", "t", "occlusion_rate", ...}``, results
+are a list of ``{"R", "t", "score"}``; ``R`` is 3x3 row-major and maps part to world or camera. A scene
+without results is the empty list ``[]``: only scenes with a result file are counted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from attentionvote.evaluation.scene_result import Array, SceneResult
+from attentionvote.geometry.pose import transform
+
+# Sileane's own matrices are orthonormal to 2.6e-6; a detector that writes float32 stays far below this too.
+ROTATION_TOLERANCE = 1e-3
+
+
+def read_json(path: str | Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        ValueError: with one sentence, when the file is missing or is not JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: the file cannot be read ({error.strerror})") from error
+    except ValueError as error:  # JSONDecodeError and UnicodeDecodeError
+        raise ValueError(f"{path}: the file must be JSON, got {error}") from error
+
+
+def read_ground_truth(path: str | Path) -> tuple[Array, Array]:
+    """Poses ``(I, 4, 4)`` in metres and occlusion rates ``(I,)`` of one scene.
+
+    Raises:
+        ValueError: with one sentence naming the file, the entry and the rule.
+    """
+    return _read(path, "occlusion_rate")
+
+
+def read_results(path: str | Path) -> tuple[Array, Array]:
+    """Poses ``(R, 4, 4)`` in metres and scores ``(R,)`` of one scene.
+
+    Raises:
+        ValueError: with one sentence naming the file, the entry and the rule.
+    """
+    return _read(path, "score")
+
+
+def write_ground_truth(path: str | Path, poses: ArrayLike, occlusion: ArrayLike) -> None:
+    """Write poses ``(I, 4, 4)`` and occlusion rates ``(I,)``; atomic."""
+    _write(path, poses, occlusion, "occlusion_rate")
+
+
+def write_results(path: str | Path, poses: ArrayLike, scores: ArrayLike) -> None:
+    """Write poses ``(R, 4, 4)`` and scores ``(R,)``; no result writes ``[]``, which counts; atomic."""
+    _write(path, poses, scores, "score")
+
+
+def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -> dict[str, SceneResult]:
+    """Every scene that has a result file, by name (sorted).
+
+    Raises:
+        ValueError: with one sentence, when there is no result file, or one without ground truth.
+    """
+    gt_directory, result_directory = Path(gt_directory), Path(result_directory)
+    for directory in (gt_directory, result_directory):
+        if not directory.is_dir():
+            raise ValueError(f"{directory}: the folder of NAME.json files does not exist")
+    results = sorted(result_directory.glob("*.json"))
+    if not results:
+        raise ValueError(f"{result_directory}: at least one NAME.json of results is needed, got none")
+    known = {path.stem for path in gt_directory.glob("*.json")}
+    orphans = [path.name for path in results if path.stem not in known]
+    if orphans:
+        raise ValueError(
+            f"{result_directory}: every result file needs ground truth of the same name in {gt_directory}, "
+            f"got {len(orphans)} without, the first is {orphans[0]}"
+        )
+    scenes = {}
+    for path in results:
+        poses, scores = read_results(path)
+        gt_poses, occlusion = read_ground_truth(gt_directory / path.name)
+        scenes[path.stem] = SceneResult(poses, scores, gt_poses, occlusion)
+    return scenes
+
+
+def _read(path: str | Path, value_key: str) -> tuple[Array, Array]:
+    content = read_json(path)
+    if not isinstance(content, list):
+        raise ValueError(f"{path}: the file must hold a list of poses, got {type(content).__name__}")
+    rotations, translations, values = (
+        np.zeros((len(content), 3, 3)),
+        np.zeros((len(content), 3)),
+        np.zeros(len(content)),
+    )
+    for i, entry in enumerate(content):
+        if not isinstance(entry, dict):
+            raise ValueError(f"{path}: entry {i} must be an object with R, t and {value_key}, got {entry!r}")
+        rotations[i] = _entry(path, i, entry, "R", (3, 3))
+        translations[i] = _entry(path, i, entry, "t", (3,))
+        values[i] = _entry(path, i, entry, value_key, ())
+    deviation = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max((-2, -1), initial=0.0)
+    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) < 0))
+    if len(wrong):
+        i = int(wrong[0])
+        raise ValueError(
+            f"{path}: R of entry {i} must be a rotation (R R^T = I within {ROTATION_TOLERANCE}, determinant +1), "
+            f"got a deviation of {deviation[i]:.3g} and determinant {np.linalg.det(rotations[i]):.3g}"
+        )
+    return transform(rotations, translations), values
+
+
+def _entry(path: str | Path, index: int, entry: dict, key: str, shape: tuple[int, ...]) -> Array:
+    if key not in entry:
+        raise ValueError(f"{path}: entry {index} must have {key}, got only {', '.join(sorted(entry)) or 'nothing'}")
+    try:
+        value = np.asarray(entry[key], dtype=np.float64)
+    except (TypeError, ValueError):
+        value = np.asarray(np.nan)
+    if key == "t" and value.shape == (3, 1):  # some writers keep the column
+        value = value[:, 0]
+    if value.shape != shape or not np.isfinite(value).all():
+        wanted = {(): "a finite number", (3,): "three finite numbers", (3, 3): "3x3 finite numbers"}[shape]
+        raise ValueError(f"{path}: {key} of entry {index} must be {wanted}, got {entry[key]!r}")
+    return value
+
+
+def _write(path: str | Path, poses: ArrayLike, values: ArrayLike, value_key: str) -> None:
+    p = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    v = np.asarray(values, dtype=np.float64).reshape(-1)
+    if len(p) != len(v):
+        raise ValueError(f"{path}: one {value_key} a pose is needed, got {len(p)} poses and {len(v)} values")
+    if not (np.isfinite(p).all() and np.isfinite(v).all()):
+        raise ValueError(f"{path}: poses and {value_key} must be finite, got NaN or inf")
+    entries = [
+        {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist(), value_key: float(value)}
+        for pose, value in zip(p, v, strict=True)
+    ]
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        temporary.write_text(json.dumps(entries, indent=1), encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,158 @@
+"""Everything that is reported of a detector on a set of scenes: flat metrics, and curves for figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.evaluation.average_distance import AverageDistance
+from attentionvote.evaluation.average_precision import DetectionScores, score_tables
+from attentionvote.evaluation.matching import Matching, match
+from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
+from attentionvote.evaluation.scene_result import Array, SceneResult, distance_tables
+from attentionvote.part import Part
+
+THRESHOLDS = (0.10, 0.05, 0.02)  # of the diameter
+DETAIL_THRESHOLD = 0.10  # at which recall by visibility and pose errors are reported
+VISIBILITY_EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+
+
+def evaluate(
+    scenes: Sequence[SceneResult],
+    part: Part,
+    thresholds: Sequence[float] = THRESHOLDS,
+    add: bool = True,
+    metric: PoseMetric | None = None,
+    occlusion_limit: float = 0.5,
+    result_limit: int | None = None,
+) -> dict[str, float]:
+    """Flat metrics; ``N`` stands for a threshold in per cent of the diameter (``10``, ``5``, ``2``).
+
+    * ``ap_N``, ``map_N``, ``f1_N``: the benchmark's macro-averaged figures;
+    * ``precision_N``, ``recall_N``: all results given, counted over all scenes together;
+    * ``duplicates_N``: results on a pose that a nearer result holds; ``strays_N``: results near nothing
+      (both are false positives); ``misses_N``: required poses that were not found;
+    * ``add_precision_N``, ``add_recall_N``: the same with ADD (Eq. 13) in place of the pose distance;
+    * ``recall_visible_50_60`` ... ``recall_visible_90_100``: recall at 10 % D by visible per cent, lower
+      edge included (the last bin also holds 100);
+    * ``center_error_mm``, ``rotation_error_deg``: medians over the true positives at 10 % D.
+
+    What nothing can be measured on (an empty visibility bin, no true positive) is absent.
+
+    Args:
+        scenes: every scene that was processed, also those without results.
+        part: gives diameter, symmetry and model points.
+        thresholds: fractions of the diameter; fewer are cheaper.
+        add: whether to compute the ADD figures, most of the time spent here.
+        metric: pose distance; of the part by default.
+        occlusion_limit: ground truth occluded up to it (inclusive) must be found.
+        result_limit: only this many best results of a scene count; all by default.
+
+    Raises:
+        ValueError: when there is no scene or no threshold, or a limit is impossible.
+    """
+    if not len(thresholds) or not all(t > 0 for t in thresholds):
+        raise ValueError(f"thresholds must be at least one positive fraction of the diameter, got {tuple(thresholds)}")
+    tables = distance_tables(scenes, metric or PoseMetric.of(part))
+    metrics: dict[str, float] = {}
+    for fraction in thresholds:
+        threshold, name = fraction * part.diameter, f"{100 * fraction:g}"
+        scores = score_tables(scenes, tables, threshold, occlusion_limit, result_limit)
+        matchings = _match_all(scenes, tables, threshold, occlusion_limit, result_limit)
+        metrics |= {f"ap_{name}": scores.ap, f"map_{name}": scores.map, f"f1_{name}": scores.f1}
+        metrics |= {f"precision_{name}": scores.precision, f"recall_{name}": scores.recall}
+        for kind in ("duplicates", "strays", "misses"):
+            metrics[f"{kind}_{name}"] = float(sum(len(getattr(matching, kind)) for matching in matchings))
+    if add:
+        average = AverageDistance.of(part, limit=max(thresholds) * part.diameter)
+        add_tables = distance_tables(scenes, average)
+        for fraction in thresholds:
+            scores = score_tables(scenes, add_tables, fraction * part.diameter, occlusion_limit, result_limit)
+            name = f"{100 * fraction:g}"
+            metrics |= {f"add_precision_{name}": scores.precision, f"add_recall_{name}": scores.recall}
+    matchings = _match_all(scenes, tables, DETAIL_THRESHOLD * part.diameter, occlusion_limit, result_limit)
+    return metrics | recall_by_visibility(scenes, matchings) | pose_errors(scenes, matchings, part)
+
+
+def recall_by_visibility(scenes: Sequence[SceneResult], matchings: Sequence[Matching]) -> dict[str, float]:
+    """Share of the ground truth that was found, in bins of its visible fraction; empty bins are absent."""
+    visible, found = [], []
+    for scene, matching in zip(scenes, matchings, strict=True):
+        # Rounded: 1 - 0.4 and the like must land on the edge they mean.
+        visible.append(np.round(1 - scene.gt_occlusion, 9))
+        hit = np.zeros(len(scene.gt_poses), dtype=bool)
+        hit[matching.pairs[:, 1]] = True
+        found.append(hit)
+    fraction, hits = np.concatenate(visible), np.concatenate(found)
+    metrics = {}
+    for low, high in pairwise(VISIBILITY_EDGES):
+        inside = (fraction >= low) & ((fraction < high) | (high == VISIBILITY_EDGES[-1]))
+        if inside.any():
+            metrics[f"recall_visible_{100 * low:.0f}_{100 * high:.0f}"] = float(hits[inside].mean())
+    return metrics
+
+
+def pose_errors(scenes: Sequence[SceneResult], matchings: Sequence[Matching], part: Part) -> dict[str, float]:
+    """Median distance of the origins (mm) and median rotation (degrees, least over the symmetries) of the
+    true positives; absent without one."""
+    pairs = [matching.true_positives for matching in matchings]
+    found = np.concatenate([scene.poses[pair[:, 0]] for scene, pair in zip(scenes, pairs, strict=True)])
+    true = np.concatenate([scene.gt_poses[pair[:, 1]] for scene, pair in zip(scenes, pairs, strict=True)])
+    if not len(found):
+        return {}
+    center_mm = 1000 * np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=-1)
+    rotation = np.degrees(rotation_errors(found, true, part.symmetry))
+    return {"center_error_mm": float(np.median(center_mm)), "rotation_error_deg": float(np.median(rotation))}
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Curves for figures.
+
+    ``precision``, ``recall``, ``scores`` ``(K + 1,)``: the mean precision-recall curve at 10 % D, from score
+    +inf (nothing given) down. ``thresholds`` ``(T,)`` fractions of D with ``ap`` ``(T,)`` (Fig. 8 of the paper).
+    """
+
+    precision: Array = field(repr=False)
+    recall: Array = field(repr=False)
+    scores: Array = field(repr=False)
+    thresholds: Array = field(repr=False)
+    ap: Array = field(repr=False)
+    at_10: DetectionScores
+
+
+def curves(
+    scenes: Sequence[SceneResult],
+    part: Part,
+    metric: PoseMetric | None = None,
+    thresholds: NDArray[np.float64] | Sequence[float] = tuple(k / 200 for k in range(21)),
+    occlusion_limit: float = 0.5,
+    result_limit: int | None = None,
+) -> Curves:
+    """Precision-recall curve at 10 % D, and AP against the threshold (0 to 10 % D in steps of half a per cent).
+
+    Raises:
+        ValueError: when there is no scene, or a limit is impossible.
+    """
+    tables = distance_tables(scenes, metric or PoseMetric.of(part))
+    fractions = np.asarray(thresholds, dtype=np.float64)
+    ap = [score_tables(scenes, tables, t * part.diameter, occlusion_limit, result_limit).ap for t in fractions]
+    at_10 = score_tables(scenes, tables, DETAIL_THRESHOLD * part.diameter, occlusion_limit, result_limit)
+    return Curves(at_10.curve_precision, at_10.curve_recall, at_10.curve_scores, fractions, np.asarray(ap), at_10)
+
+
+def _match_all(
+    scenes: Sequence[SceneResult],
+    tables: Sequence[Array],
+    threshold: float,
+    occlusion_limit: float,
+    result_limit: int | None,
+) -> list[Matching]:
+    return [
+        match(table, scene.scores, scene.to_find(occlusion_limit), threshold, result_limit)
+        for scene, table in zip(scenes, tables, strict=True)
+    ]
