@@ -1,0 +1,87 @@
+"""The simulated depth camera: intrinsics, and where it stands relative to the bin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from attentionvote.geometry.pose import inverse, rotation_about, transform
+
+# A PhoXi M above a bin of 143 mm parts; the distance scales with D, so every part fills the same picture.
+REFERENCE_DISTANCE = 0.80
+REFERENCE_DIAMETER = 0.143
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole intrinsics in pixels; pixel ``(u, v)`` has its centre at ``(u, v)``, OpenCV convention."""
+
+    width: int = 1032
+    height: int = 772
+    fx: float = 1700.0
+    fy: float = 1700.0
+    cx: float = 516.0
+    cy: float = 386.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "fx", "fy"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"camera {name} must be positive, got {getattr(self, name)}")
+
+    def rays(self, pixels: ArrayLike) -> NDArray[np.float64]:
+        """Points ``(P, 2)`` of the plane z = 1 seen at pixels ``(P, 2)`` (u, v)."""
+        return (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Pixels ``(..., 2)`` (u, v) of points ``(..., 3)`` in front of the camera, camera frame."""
+        p = np.asarray(points, dtype=np.float64)
+        return p[..., :2] / p[..., 2:] * (self.fx, self.fy) + (self.cx, self.cy)
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How the camera of a scene is drawn; every scene has its own, so that consecutive piles differ in the picture.
+
+    Args:
+        camera: intrinsics.
+        distance: metres to the bin's middle; None scales 0.80 m with D / 143 mm.
+        distance_jitter: relative, uniform in ``1 - jitter .. 1 + jitter``.
+        shift: sideways jitter per axis, as a share of the distance.
+        tilt_degrees: the camera swings around the bin by up to so much, in a random direction.
+        roll_degrees: rotation about the viewing axis, uniform in +- so much.
+    """
+
+    camera: Camera = field(default_factory=Camera)
+    distance: float | None = None
+    distance_jitter: float = 0.08
+    shift: float = 0.015
+    tilt_degrees: float = 6.0
+    roll_degrees: float = 15.0
+
+    def __post_init__(self) -> None:
+        if self.distance is not None and not self.distance > 0:
+            raise ValueError(f"camera distance must be positive metres, got {self.distance}")
+        for name, low, high in (
+            ("distance_jitter", 0, 0.5),
+            ("shift", 0, 0.5),
+            ("tilt_degrees", 0, 60),
+            ("roll_degrees", 0, 180),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"camera {name} must lie in {low}..{high}, got {getattr(self, name)}")
+
+    def sample(self, diameter: float, bin_height: float, rng: np.random.Generator) -> NDArray[np.float64]:
+        """``camera_from_bin`` ``(4, 4)``: the camera looks down at a point a third up the bin's axis, with jitter."""
+        distance = self.distance or REFERENCE_DISTANCE * diameter / REFERENCE_DIAMETER
+        distance *= rng.uniform(1 - self.distance_jitter, 1 + self.distance_jitter)
+        shift = rng.uniform(-1, 1, size=2) * self.shift * distance
+        roll, azimuth = rng.uniform(-1, 1) * np.radians(self.roll_degrees), rng.uniform(0, 2 * np.pi)
+        # Uniform over the spherical cap (to first order), not bunched at its pole.
+        tilt = np.radians(self.tilt_degrees) * np.sqrt(rng.random())
+        swing = rotation_about((np.cos(azimuth), np.sin(azimuth), 0.0), tilt)
+        down = np.diag([1.0, -1.0, -1.0])  # camera axes in the bin frame: looking down, image x along bin x
+        rotation = swing @ rotation_about((0.0, 0.0, 1.0), roll) @ down
+        target = np.array([*shift, bin_height / 3])
+        return inverse(transform(rotation, target - distance * rotation[:, 2]))

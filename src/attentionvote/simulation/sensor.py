@@ -1,0 +1,203 @@
+"""From a stored scene to the point cloud a depth sensor would deliver.
+
+Rays are cast at random pixels of the picture, so a cloud of 40,000 points costs 40,000 hits, not a whole image.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.scene import Scene
+from attentionvote.simulation.raycast import BinSurface, Floats, Hits, PartCaster
+from attentionvote.simulation.scene_record import SceneRecord
+
+PRESETS = ("none", "gaussian", "phoxi")
+# Lengths of the phoxi preset are for this working distance and scale with the scene's, as the vendor's sizes do.
+_WORKING_DISTANCE = 0.80
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A depth sensor.
+
+    Args:
+        preset: ``none`` (exact points: the paper's and IPA's data), ``gaussian`` (isotropic noise, a regulariser) or
+            ``phoxi`` (a structured-light scanner: everything below).
+        sigma_mm: ``gaussian``: standard deviation per axis; keep it under 2 % of D.
+        axial_sigma_mm: noise along the ray at 0.65 m and perpendicular incidence; grows with z^2 / cos(incidence).
+        grazing_degrees: incidence, at camera or projector, at which points begin to be lost and all are lost.
+        baseline: metres from camera to projector, left or right at random: what the projector does not see is lost.
+        edge_jump: metres of depth between neighbouring pixels that make an edge.
+        edge_dropout: share of edge points lost.
+        edge_flying: share of edge points that land between the two surfaces.
+        dropout: share of points lost anywhere.
+        specular: share of points lost whose normal lies within 5 degrees of mirror reflection into the camera.
+
+    ``baseline`` and ``edge_jump`` hold at 0.80 m and scale with the working distance. The phoxi figures follow public
+    data sheets of the Photoneo PhoXi M; they were not fitted to a real sensor.
+
+    Raises:
+        ValueError: on an unknown preset or an impossible value.
+    """
+
+    preset: str = "none"
+    sigma_mm: float = 0.3
+    axial_sigma_mm: float = 0.1
+    grazing_degrees: tuple[float, float] = (70.0, 85.0)
+    baseline: float = 0.27
+    edge_jump: float = 0.003
+    edge_dropout: float = 0.5
+    edge_flying: float = 0.1
+    dropout: float = 0.01
+    specular: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            near = difflib.get_close_matches(str(self.preset), PRESETS, n=1, cutoff=0.0)[0]
+            raise ValueError(
+                f"sensor preset must be one of {', '.join(PRESETS)}, got {self.preset!r}: nearest is {near}"
+            )
+        object.__setattr__(self, "grazing_degrees", tuple(float(g) for g in self.grazing_degrees))
+        for name in ("sigma_mm", "axial_sigma_mm", "baseline"):
+            if not 0 <= getattr(self, name) < 100:
+                raise ValueError(f"sensor {name} must lie in 0..100, got {getattr(self, name)}")
+        if not self.edge_jump > 0:
+            raise ValueError(f"sensor edge_jump must be positive metres, got {self.edge_jump}")
+        for name in ("edge_dropout", "edge_flying", "dropout", "specular"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"sensor {name} must be a share in 0..1, got {getattr(self, name)}")
+        if self.edge_dropout + self.edge_flying > 1:
+            raise ValueError(
+                f"sensor edge_dropout + edge_flying must be at most 1, got {self.edge_dropout + self.edge_flying:g}"
+            )
+        if len(self.grazing_degrees) != 2 or not 0 <= self.grazing_degrees[0] < self.grazing_degrees[1] <= 90:
+            raise ValueError(f"sensor grazing_degrees must be a range within 0..90, got {list(self.grazing_degrees)}")
+
+
+def synthesize(
+    record: SceneRecord, caster: PartCaster, sensor: Sensor, max_points: int, rng: np.random.Generator
+) -> Scene:
+    """Point cloud of a scene: the parts' points only, at random pixels, in random order.
+
+    Args:
+        record: the stored scene.
+        caster: of the scene's part.
+        sensor: which effects to apply; noise is in the points, so normals estimated later see it.
+        max_points: most points; fewer when the picture has no more.
+        rng: decides pixels and noise.
+
+    Returns:
+        A scene without normals.
+
+    Raises:
+        ValueError: when ``max_points`` is not positive.
+    """
+    if max_points < 1:
+        raise ValueError(f"max_points must be at least 1, got {max_points}")
+    poses, surface = record.camera_from_part, record.bin_surface
+    scanner = _Scanner(record, caster, sensor, rng) if sensor.preset == "phoxi" else None
+    u0, u1, v0, v1 = caster.pixel_box(poses, record.camera)
+    width, height = max(u1 - u0 + 1, 0), max(v1 - v0 + 1, 0)
+    order = rng.permutation(np.arange(width * height, dtype=np.int32))
+    points: list[Floats] = []
+    ids: list[NDArray[np.int32]] = []
+    found, used = 0, 0
+    while found < max_points and used < len(order):
+        # The share of pixels that end as points is guessed for the first rays and known for the rest.
+        yielded = found / used if used else 0.5
+        batch = int((max_points - found) / max(yielded, 0.02) * 1.03) + 64
+        chosen = order[used : used + batch]
+        used += len(chosen)
+        pixels = np.stack([chosen % width + u0, chosen // width + v0], axis=1)
+        hits = caster.cast(poses, record.camera.rays(pixels), surface)
+        if scanner is not None:
+            new_points, new_ids = scanner.measure(pixels, hits)
+        else:
+            foreground = hits.instance >= 0
+            rays = record.camera.rays(pixels[foreground])
+            new_points = np.c_[rays, np.ones(len(rays))] * hits.depth[foreground, None]
+            new_ids = hits.instance[foreground]
+        points.append(new_points)
+        ids.append(new_ids)
+        found += len(new_points)
+    cloud = np.concatenate([np.zeros((0, 3)), *points])[:max_points]
+    if sensor.preset == "gaussian":
+        cloud = cloud + rng.normal(scale=sensor.sigma_mm / 1000, size=cloud.shape)
+    return Scene(
+        points=cloud.astype(np.float32),
+        instance_ids=np.concatenate([np.zeros(0, dtype=np.int32), *ids])[:max_points],
+        camera_from_part=poses,
+        visible_fraction=record.visible_fraction,
+        part_ids=np.zeros(len(poses), dtype=np.int32),
+    )
+
+
+class _Scanner:
+    """The phoxi preset on one scene; which side the projector is on is drawn once."""
+
+    def __init__(self, record: SceneRecord, caster: PartCaster, sensor: Sensor, rng: np.random.Generator) -> None:
+        self.record, self.caster, self.sensor, self.rng = record, caster, sensor, rng
+        self.scale = float(record.camera_from_bin[2, 3]) / _WORKING_DISTANCE
+        side = rng.choice([-1.0, 1.0])
+        self.projector = np.array([side * sensor.baseline * self.scale, 0.0, 0.0])
+        self.poses_from_projector = record.camera_from_part.copy()
+        self.poses_from_projector[:, :3, 3] -= self.projector
+        self.surface_from_projector: BinSurface = record.bin_surface.moved(self.projector)
+
+    def measure(self, pixels: NDArray[np.int64], hits: Hits) -> tuple[Floats, NDArray[np.int32]]:
+        """Points ``(Q, 3)`` and their instances of those pixels at which the scanner measures a part."""
+        sensor, rng = self.sensor, self.rng
+        keep = np.flatnonzero(hits.instance >= 0)
+        keep = keep[rng.random(len(keep)) >= sensor.dropout]
+        rays = self.record.camera.rays(pixels[keep])
+        points = np.c_[rays, np.ones(len(rays))] * hits.depth[keep, None]
+        cosine, lost = self._reflection(points, hits.normal[keep])
+        seen = rng.random(len(keep)) >= lost
+        keep, points, cosine = keep[seen], points[seen], cosine[seen]
+        # Margin: a point must not be shadowed by its own surface.
+        shadow = self.caster.blocked(
+            self.poses_from_projector, points - self.projector, 5e-4 * self.scale, self.surface_from_projector
+        )
+        keep, points, cosine = keep[~shadow], points[~shadow], cosine[~shadow]
+        z, lost_at_edge = self._edges(pixels[keep], points[:, 2])
+        sigma = sensor.axial_sigma_mm / 1000 * (z / 0.65) ** 2 / np.maximum(cosine, 0.2)
+        noisy = z + rng.normal(size=len(z)) * sigma
+        points = points * (noisy / points[:, 2])[:, None]
+        return points[~lost_at_edge], hits.instance[keep[~lost_at_edge]]
+
+    def _reflection(self, points: Floats, normal: Floats) -> tuple[Floats, Floats]:
+        """Cosine of the incidence at the camera, and probability that the point is lost to grazing or glare."""
+        to_camera = -points / np.linalg.norm(points, axis=1, keepdims=True)
+        to_projector = self.projector - points
+        to_projector /= np.linalg.norm(to_projector, axis=1, keepdims=True)
+        cosine = np.einsum("pi,pi->p", normal, to_camera)
+        worst = np.minimum(cosine, np.einsum("pi,pi->p", normal, to_projector))
+        angle = np.degrees(np.arccos(np.clip(worst, -1, 1)))
+        start, end = self.sensor.grazing_degrees
+        lost = np.clip((angle - start) / (end - start), 0, 1)
+        if self.sensor.specular > 0:
+            half = to_camera + to_projector
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            mirror = np.einsum("pi,pi->p", normal, half) > np.cos(np.radians(5))
+            lost = np.maximum(lost, mirror * self.sensor.specular)
+        return cosine, lost
+
+    def _edges(self, pixels: NDArray[np.int64], z: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Depth after flying pixels, and which points an edge swallows; looks at the four neighbouring pixels."""
+        neighbours = (pixels[:, None] + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
+        rays = self.record.camera.rays(neighbours)
+        depth = self.caster.cast(self.record.camera_from_part, rays, self.record.bin_surface).depth.reshape(-1, 4)
+        jump = np.abs(depth - z[:, None])
+        edge = jump.max(axis=1, initial=0) > self.sensor.edge_jump * self.scale
+        # A mixed measurement lies between this surface and the farthest-off neighbour that reflects at all.
+        finite = np.where(np.isfinite(depth), jump, -1)
+        other = np.take_along_axis(depth, finite.argmax(axis=1)[:, None], axis=1)[:, 0]
+        fate = self.rng.random(len(z))
+        lost = edge & (fate < self.sensor.edge_dropout)
+        flying = edge & ~lost & (fate < self.sensor.edge_dropout + self.sensor.edge_flying) & np.isfinite(other)
+        weight = self.rng.random(len(z))
+        return np.where(flying, z + weight * (np.where(flying, other, z) - z), z), lost
