@@ -1,0 +1,162 @@
+"""Where runs are kept: choose the store, make sure that it exists, connect to it."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import fcntl
+import logging
+import os
+import re
+import urllib.error
+import urllib.request
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
+SERVERS = ("http", "https")
+# Before the import of MLflow: no telemetry, no chatter; a dead server fails within seconds rather than minutes,
+# because our own writers retry in the background anyway. Existing settings of the user win.
+ENVIRONMENT = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "DO_NOT_TRACK": "true",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "30",
+    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
+}
+
+
+def resolve_store(store: str | None) -> str:
+    """The store's URI: the argument, else ``MLFLOW_TRACKING_URI``, else ``outputs/mlflow.db`` of the working directory.
+
+    Args:
+        store: ``sqlite:///relative/or/absolute.db``, ``http(s)://host:port``, a database URI, or the path of an
+            SQLite file that ends in ``.db``.
+
+    Raises:
+        ValueError: the URI has another scheme, with the nearest valid one.
+    """
+    store = store or os.environ.get("MLFLOW_TRACKING_URI") or "outputs/mlflow.db"
+    if "://" not in store and not store.startswith(("file:", "sqlite:")) and store.endswith(".db"):
+        store = f"sqlite:///{store}"
+    scheme = store.split(":", 1)[0].split("+", 1)[0] if ":" in store else ""
+    if scheme == "sqlite":
+        path = re.sub(r"^sqlite(\+\w+)?:///", "", store)
+        if path == store or not path:
+            raise ValueError(f"an SQLite tracking store must read sqlite:///PATH.db, got {store!r}")
+        return f"sqlite:///{Path(path).expanduser().absolute()}"
+    if scheme in SERVERS or scheme in DATABASES:
+        return store.rstrip("/") if scheme in SERVERS else store
+    if scheme in ("file", ""):
+        raise ValueError(
+            f"tracking store must be an SQLite file or a server, because MLflow no longer writes folders; "
+            f"got {store!r}, nearest: 'sqlite:///outputs/mlflow.db'"
+        )
+    choices = [*DATABASES, *SERVERS]
+    near = difflib.get_close_matches(scheme, choices, 1, 0.0)[0]
+    raise ValueError(f"tracking store must start with one of {', '.join(choices)}, got {store!r}, nearest: '{near}://'")
+
+
+def is_server(uri: str) -> bool:
+    """Whether the store is reached over HTTP (then the server decides where artefacts go)."""
+    return uri.split(":", 1)[0] in SERVERS
+
+
+def artifact_root(uri: str) -> Path | None:
+    """Folder of the artefacts of a store on this machine, None for a server."""
+    if is_server(uri):
+        return None
+    if uri.startswith("sqlite:///"):
+        return Path(uri.removeprefix("sqlite:///")).parent / "mlartifacts"
+    return Path("outputs/mlartifacts").absolute()
+
+
+@contextlib.contextmanager
+def _exclusive(uri: str) -> Iterator[None]:
+    """One process at a time: MLflow's first touch of an empty SQLite file is not safe for several."""
+    if not uri.startswith("sqlite:///"):
+        yield
+        return
+    path = Path(uri.removeprefix("sqlite:///"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_name(path.name + ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel even on kill -9
+        yield
+
+
+def _check_server(uri: str) -> None:
+    try:
+        with urllib.request.urlopen(f"{uri}/health", timeout=10):
+            pass
+    except urllib.error.HTTPError as error:
+        if error.code == 403:
+            raise ConnectionError(
+                f"tracking server {uri} refuses its own address (HTTP 403); start it with --allowed-hosts naming it"
+            ) from error
+        # Any other answer is an answer: a proxy may hide /health.
+    except OSError as error:
+        reason = getattr(error, "reason", error)
+        raise ConnectionError(
+            f"tracking server {uri} must answer, got: {reason}; "
+            "start it, or unset MLFLOW_TRACKING_URI for the local store"
+        ) from error
+
+
+def quiet_environment() -> None:
+    """Set MLflow's switches that must be set before its import."""
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+
+
+def connect(uri: str) -> MlflowClient:
+    """A client of the store; creates an SQLite file and its tables, safely when several processes do so at once.
+
+    Raises:
+        ConnectionError: a server does not answer.
+        ValueError: the store cannot be used (for example tables of another MLflow version).
+    """
+    if is_server(uri):
+        _check_server(uri)
+    quiet_environment()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MLflow's dependencies deprecate each other at import
+        from mlflow import MlflowClient
+        from mlflow.exceptions import MlflowException
+    # One sentence of ours says that a server is away; urllib3 and alembic would add a page.
+    for name in ("urllib3.connectionpool", "alembic"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    with _exclusive(uri):
+        try:
+            return MlflowClient(uri, registry_uri=uri)
+        except MlflowException as error:
+            sentence = str(error).strip().splitlines()[0]
+            hint = f"; try `mlflow db upgrade {uri}`" if "schema" in sentence else ""
+            raise ValueError(f"tracking store {uri} cannot be used: {sentence}{hint}") from error
+        except Exception as error:  # SQLAlchemy's, for a file that is no database or cannot be opened
+            sentence = str(error).strip().splitlines()[0]
+            raise ValueError(f"tracking store {uri} cannot be opened: {sentence}") from error
+
+
+def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
+    """Id of the experiment, created when new and restored when it had been deleted in the UI."""
+    from mlflow.exceptions import MlflowException
+
+    root = artifact_root(uri)
+    with _exclusive(uri):
+        experiment = client.get_experiment_by_name(name)
+        if experiment is None:
+            try:
+                return client.create_experiment(name, artifact_location=root.as_uri() if root else None)
+            except MlflowException:  # somebody else was faster (a server or database has no file lock of ours)
+                experiment = client.get_experiment_by_name(name)
+                if experiment is None:
+                    raise
+        if experiment.lifecycle_stage == "deleted":
+            client.restore_experiment(experiment.experiment_id)
+        return experiment.experiment_id
