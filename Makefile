@@ -1,0 +1,85 @@
+# One command a stage. `make help` lists them; ARGS passes any setting on, e.g.
+#   make train OBJECT=connecting_rod ARGS="trainer.max_epochs=20 seed=1"
+
+PYTHON ?= $(or $(shell command -v python3.11 2>/dev/null),$(shell command -v python3 2>/dev/null),python3.11)
+VENV := .venv
+PY := $(VENV)/bin/python
+# Younger than what it was made from = the environment is complete and up to date.
+STAMP := $(VENV)/.setup-complete
+
+OBJECT ?=
+NAME ?=
+MESH ?=
+UNITS ?=
+ARGS ?=
+PYTEST_ARGS ?=
+object := $(if $(OBJECT),object=$(OBJECT))
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup system train smoke generate view part ui test test-fast lint format clean
+
+help: ## Show this list
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## Create .venv with the pinned dependencies (every other target does it when needed)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(MAKE) --no-print-directory system
+	@echo "setup: installing the pinned dependencies into $(VENV) (once, some minutes)" >&2
+	@test -x $(PY) || "$(PYTHON)" -m venv $(VENV) >&2
+	@$(PY) -m pip install --quiet --disable-pip-version-check --no-input -c constraints.txt -e '.[train,dev]' >&2 \
+		|| { echo "setup: the installation failed (pip's reason is above); run the same command to try again" >&2; exit 1; }
+	@touch $@
+
+# The wheels bring their own libraries (checked with ldd): what the system must have is a Python 3.11 with
+# venv and a C compiler for geometry/pointops.c.
+system:
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
+		echo "setup: Python 3.11 is needed, found $$("$(PYTHON)" --version 2>/dev/null || echo none);" \
+		"install it (Debian: python3.11) or name it, PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import venv, ensurepip' 2>/dev/null || { \
+		echo "setup: Python's venv module is missing; install it (Debian: python3.11-venv)" >&2; exit 1; }
+	@echo '#include <math.h>' | cc -E - >/dev/null 2>&1 || { \
+		echo "setup: a C compiler with headers (cc) is missing; install it (Debian: gcc libc6-dev)" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import ctypes; ctypes.CDLL("libstdc++.so.6")' 2>/dev/null || { \
+		echo "setup: the library libstdc++.so.6 is missing; install it (Debian: libstdc++6)" >&2; exit 1; }
+
+train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [ARGS="experiment=paper ..."]; resumes by itself
+	@$(PY) pipelines/train.py $(object) $(ARGS)
+
+smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores
+	@$(PY) pipelines/train.py object=$(or $(OBJECT),connecting_rod) experiment=smoke $(ARGS)
+
+generate: $(STAMP) ## Drop parts into a bin by physics and keep the scenes: OBJECT=connecting_rod
+	@$(PY) pipelines/generate.py $(object) $(ARGS)
+
+view: $(STAMP) ## Write an interactive 3D page and pictures of a scene: OBJECT=connecting_rod
+	@$(PY) pipelines/view.py $(object) $(ARGS)
+
+part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.stl [UNITS=mm]; then `make train OBJECT=bracket`
+	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) $(ARGS)
+
+ui: $(STAMP) ## Open the tracked runs in a browser (MLflow)
+	@$(PY) pipelines/ui.py $(ARGS)
+
+test: $(STAMP) ## Run every test
+	@$(PY) -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
+
+test-fast: $(STAMP) ## Run the tests that take seconds
+	@$(PY) -m pytest -m "not slow" $(PYTEST_ARGS)
+
+lint: $(STAMP) ## Check style, types and import directions
+	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
+	@$(PY) -m mypy
+	@MYPYPATH=src:pipelines $(PY) -m mypy pipelines
+	@$(VENV)/bin/lint-imports --no-logo
+
+format: $(STAMP) ## Rewrite the sources in the project's style
+	@$(PY) -m ruff check --fix .
+	@$(PY) -m ruff format .
+
+clean: ## Remove caches and build products; keeps .venv, data and outputs
+	@rm -rf build src/*.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	@find src pipelines tests -name __pycache__ -type d -prune -exec rm -rf {} +
