@@ -48,15 +48,17 @@ class BinSurface:
         through a side has met the outside of that wall.
         """
         bin_from_camera = inverse(self.camera_from_bin)
-        origin = bin_from_camera[:3, 3]
-        direction = np.c_[xy, np.ones(len(xy))] @ bin_from_camera[:3, :3].T
-        direction = np.where(np.abs(direction) < 1e-15, 1e-15, direction)
-        low = np.array([-self.size[0] / 2, -self.size[1] / 2, 0.0])
-        high = np.array([self.size[0] / 2, self.size[1] / 2, self.size[2]])
-        a, b = (low - origin) / direction, (high - origin) / direction
-        near, far = np.minimum(a, b), np.maximum(a, b)
-        enter, leave = near.max(axis=1), far.min(axis=1)
-        through_top = (near.argmax(axis=1) == 2) & (direction[:, 2] < 0)
+        origin, rotation = bin_from_camera[:3, 3], bin_from_camera[:3, :3]
+        # Column by column: a third of the time of arrays (P, 3).
+        enter, leave = np.full(len(xy), -np.inf), np.full(len(xy), np.inf)
+        for axis in range(3):
+            low, high = (0.0, self.size[2]) if axis == 2 else (-self.size[axis] / 2, self.size[axis] / 2)
+            direction = xy[:, 0] * rotation[axis, 0] + (xy[:, 1] * rotation[axis, 1] + rotation[axis, 2])
+            inverted = 1.0 / np.where(np.abs(direction) < 1e-15, 1e-15, direction)
+            a, b = (low - origin[axis]) * inverted, (high - origin[axis]) * inverted
+            near = np.minimum(a, b)
+            through_top = (near > enter) & (direction < 0)  # holds for the last axis, z
+            enter, leave = np.maximum(enter, near), np.minimum(leave, np.maximum(a, b))
         depth = np.where(through_top, leave, enter)
         return np.where((enter < leave) & (depth > 0), depth, np.inf)
 
@@ -83,40 +85,58 @@ class PartCaster:
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, triangles.astype(np.float32))
 
-    def cast(self, camera_from_part: Floats, xy: Floats, surface: BinSurface | None = None) -> Hits:
+    def cast(
+        self, camera_from_part: Floats, xy: Floats, surface: BinSurface | None = None, background: bool = True
+    ) -> Hits:
         """First hits of rays from the origin through ``xy`` ``(P, 2)`` on the plane z = 1.
 
         Args:
             camera_from_part: ``(I, 4, 4)`` poses; every instance must lie in front of the origin (z > 0).
             xy: rays.
             surface: the bin, or None for none.
+            background: also compute the bin's depth along rays that meet no instance; inf there otherwise.
+
+        Raises:
+            ValueError: when an instance reaches behind the origin.
         """
-        depth = np.full(len(xy), np.inf) if surface is None else surface.depth(xy)
-        # Parts rest a fraction of a millimetre inside floor and walls: such points still belong to the part.
-        depth_limit = depth + 0.005 * self.part.diameter
-        best = np.full(len(xy), np.inf)
-        instance = np.full(len(xy), -1, dtype=np.int32)
-        normal = np.zeros((len(xy), 3))
+        # Sorted by x, the rays that can meet an instance are a slice, then a comparison in y.
         order = np.argsort(xy[:, 0])
+        rays = np.ones((len(xy), 3), dtype=np.float32)
+        rays[:, :2] = xy[order]
         x, y = xy[order, 0], xy[order, 1]
+        nearest = np.full(len(xy), np.inf, dtype=np.float32)
+        owner = np.full(len(xy), -1, dtype=np.int32)
+        face = np.zeros(len(xy), dtype=np.int32)
         low, high = self._outline_boxes(camera_from_part)
         first, last = np.searchsorted(x, low[:, 0], "left"), np.searchsorted(x, high[:, 0], "right")
         for i, pose in enumerate(camera_from_part):
             inside = y[first[i] : last[i]]
-            rays = order[first[i] : last[i]][(inside >= low[i, 1]) & (inside <= high[i, 1])]
-            t, face = self._cast_one(pose, xy[rays])
-            closer = (face >= 0) & (t < best[rays]) & (t < depth_limit[rays])
-            rays = rays[closer]
-            best[rays], instance[rays] = t[closer], i
-            normal[rays] = self._normals[face[closer]] @ pose[:3, :3].T
-        hit = instance >= 0
-        depth[hit] = best[hit]
-        away = np.einsum("pi,pi->p", normal[:, :2], xy) + normal[:, 2] > 0
-        normal[away] *= -1  # only for open meshes: a closed one shows its outside
+            chosen = np.flatnonzero((inside >= low[i, 1]) & (inside <= high[i, 1])) + first[i]
+            t, primitive = self._cast_one(pose, rays[chosen])
+            closer = (primitive >= 0) & (t < nearest[chosen])
+            chosen = chosen[closer]
+            nearest[chosen], owner[chosen], face[chosen] = t[closer], i, primitive[closer]
+        depth, instance = np.full(len(xy), np.inf), np.full(len(xy), -1, dtype=np.int32)
+        normal = np.zeros((len(xy), 3))
+        hit = np.flatnonzero(owner >= 0)
+        ray, t, owner, face = order[hit], nearest[hit].astype(np.float64), owner[hit], face[hit]
+        if surface is not None:
+            wall = np.full(len(xy), np.inf)
+            wanted = slice(None) if background else ray
+            wall[wanted] = surface.depth(xy[wanted])
+            depth[:] = wall
+            # Parts rest a fraction of a millimetre inside floor and walls: such points still belong to the part.
+            front = t < wall[ray] + 0.005 * self.part.diameter
+            ray, t, owner, face = ray[front], t[front], owner[front], face[front]
+        depth[ray], instance[ray] = t, owner
+        turned = np.einsum("pij,pj->pi", camera_from_part[owner, :3, :3], self._normals[face])
+        # A closed surface shows its outside; only open ones need the sign.
+        away = np.einsum("pi,pi->p", turned[:, :2], xy[ray]) + turned[:, 2] > 0
+        normal[ray] = np.where(away[:, None], -turned, turned)
         return Hits(depth, instance, normal)
 
     def blocked(self, camera_from_part: Floats, points: Floats, margin: float, surface: BinSurface | None) -> NDArray:
-        """``(P,)`` bool: something lies between the origin and ``points`` ``(P, 3)``, more than ``margin`` (m) before."""
+        """``(P,)`` bool: the ray to ``points`` ``(P, 3)`` ends more than ``margin`` metres before them."""
         depth = self.cast(camera_from_part, points[:, :2] / points[:, 2:], surface).depth
         return depth < points[:, 2] - margin
 
@@ -142,7 +162,9 @@ class PartCaster:
         for i, pose in enumerate(camera_from_part):
             v, u = np.mgrid[first[i, 1] : last[i, 1] + 1, first[i, 0] : last[i, 0] + 1]
             pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-            t, face = self._cast_one(pose, camera.rays(pixels * stride))
+            rays = np.ones((len(pixels), 3), dtype=np.float32)
+            rays[:, :2] = camera.rays(pixels * stride)
+            t, face = self._cast_one(pose, rays)
             hit = face >= 0
             silhouette[i] = hit.sum()
             row, column = (pixels[hit] - origin).T[::-1]
@@ -175,12 +197,13 @@ class PartCaster:
         projected = outline[..., :2] / outline[..., 2:]
         return projected.min(axis=1) - 1e-9, projected.max(axis=1) + 1e-9
 
-    def _cast_one(self, pose: Floats, xy: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays at one instance alone."""
-        if not len(xy):
-            return np.zeros(0), np.zeros(0, dtype=np.int64)
+    def _cast_one(self, pose: Floats, rays: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays ``(P, 3)`` (x, y, 1) at one instance alone."""
+        if not len(rays):
+            return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int32)
         part_from_camera = inverse(pose)
-        direction = (np.c_[xy, np.ones(len(xy))] @ part_from_camera[:3, :3].T).astype(np.float32)
-        origin = np.broadcast_to(part_from_camera[:3, 3].astype(np.float32), direction.shape)
-        out = self._scene.run(np.ascontiguousarray(origin), direction, output=1)
-        return out["tfar"].astype(np.float64), out["primID"].astype(np.int64)
+        direction = rays @ part_from_camera[:3, :3].T.astype(np.float32)
+        origin = np.empty_like(direction)
+        origin[:] = part_from_camera[:3, 3]
+        out = self._scene.run(origin, direction, output=1)
+        return out["tfar"], out["primID"]

@@ -182,7 +182,7 @@ def generate_scene_set(
 
     if part.digest != spec.part_digest:
         raise ValueError(
-            f"{part.name}: the scene set's specification is for part {spec.part_digest[:12]}, this is {part.digest[:12]}"
+            f"{part.name}: the scene set is specified for part {spec.part_digest[:12]}, this is {part.digest[:12]}"
         )
     if workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")

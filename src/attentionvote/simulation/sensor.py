@@ -113,7 +113,7 @@ def synthesize(
         chosen = order[used : used + batch]
         used += len(chosen)
         pixels = np.stack([chosen % width + u0, chosen // width + v0], axis=1)
-        hits = caster.cast(poses, record.camera.rays(pixels), surface)
+        hits = caster.cast(poses, record.camera.rays(pixels), surface, background=False)
         if scanner is not None:
             new_points, new_ids = scanner.measure(pixels, hits)
         else:
