@@ -12,7 +12,21 @@ _MODULE_OF = {
     "largest_vertex_distance": "mesh",
     "load_surface": "mesh",
     "load_part": "part_files",
-    # scenes helper: add lines here
+    "Camera": "camera",
+    "CameraSettings": "camera",
+    "convex_hulls": "decomposition",
+    "BinSettings": "drop",
+    "DropSettings": "drop",
+    "drop_parts": "drop",
+    "PartCaster": "raycast",
+    "SceneRecord": "scene_record",
+    "SceneSet": "scene_set",
+    "generate_scene_set": "scene_set",
+    "SceneSetSpec": "scene_spec",
+    "scene_set_directory": "scene_spec",
+    "scene_set_specs": "scene_spec",
+    "Sensor": "sensor",
+    "synthesize": "sensor",
 }
 
 __all__ = sorted(_MODULE_OF)

@@ -15,7 +15,8 @@ from pathlib import Path
 from attentionvote.part import Part
 from attentionvote.simulation.decomposition import Hulls
 from attentionvote.simulation.raycast import PartCaster
-from attentionvote.simulation.scene_set import SceneSetSpec, write_cycle
+from attentionvote.simulation.scene_set import write_cycle
+from attentionvote.simulation.scene_spec import SceneSetSpec
 
 _job: tuple[Part, Hulls, PartCaster, SceneSetSpec, Path] | None = None  # of a worker process
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.part import Part
+
+log = logging.getLogger(__name__)
 
 Hulls = tuple[NDArray[np.float64], ...]
 
@@ -45,6 +48,7 @@ def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cac
     if path.is_file():
         with np.load(path) as stored:
             return tuple(stored[f"hull_{i:03d}"] for i in range(len(stored.files)))
+    log.info("%s: splitting the surface into convex pieces (once per part, some seconds)", part.name)
     hulls = _decompose(part, threshold, max_vertices)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")

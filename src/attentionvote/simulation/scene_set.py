@@ -14,81 +14,28 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from attentionvote.part import Part
-from attentionvote.simulation.camera import CameraSettings
 from attentionvote.simulation.decomposition import Hulls, convex_hulls
-from attentionvote.simulation.drop import BinSettings, DropSettings, drop_parts
+from attentionvote.simulation.drop import drop_parts
 from attentionvote.simulation.raycast import BinSurface, PartCaster
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records
+from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
 
-FORMAT_VERSION = 1
-
-
-@dataclass(frozen=True)
-class SceneSetSpec:
-    """Everything that determines the content of a scene set.
-
-    Args:
-        part_digest: ``Part.digest``.
-        split: name of the split; it enters the seeds, so splits never share a cycle.
-        cycles: number of drop cycles.
-        seed: any non-negative integer.
-        drop_counts: a cycle's pile is kept after these drops.
-        bin, camera, drop: their settings.
-        visibility_stride: visibility is measured on every so-many-th pixel.
-
-    Raises:
-        ValueError: when a setting is impossible.
-    """
-
-    part_digest: str
-    split: str
-    cycles: int
-    seed: int = 0
-    drop_counts: tuple[int, ...] = (6, 10, 14, 18, 22, 26, 30)
-    bin: BinSettings = field(default_factory=BinSettings)
-    camera: CameraSettings = field(default_factory=CameraSettings)
-    drop: DropSettings = field(default_factory=DropSettings)
-    visibility_stride: int = 2
-    format_version: int = FORMAT_VERSION
-
-    def __post_init__(self) -> None:
-        counts = tuple(int(c) for c in self.drop_counts)
-        object.__setattr__(self, "drop_counts", counts)
-        if not self.split or not self.split.replace("_", "").replace("-", "").isalnum():
-            raise ValueError(f"split must be a word of letters, digits, - and _, got {self.split!r}")
-        if self.cycles < 1:
-            raise ValueError(f"cycles must be at least 1, got {self.cycles}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
-        if not counts or counts[0] < 1 or counts[-1] > 200 or list(counts) != sorted(set(counts)):
-            raise ValueError(f"drop_counts must be increasing numbers within 1..200, got {list(counts)}")
-        if not 1 <= self.visibility_stride <= 8:
-            raise ValueError(f"visibility_stride must lie in 1..8, got {self.visibility_stride}")
-
-    def as_dict(self) -> dict:
-        """Plain JSON values, as written into the manifest."""
-        return json.loads(json.dumps(asdict(self)))
-
-    def digest(self) -> str:
-        """Sha256 of the specification."""
-        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()
-
-    def cycle_seed(self, cycle: int) -> np.random.SeedSequence:
-        """Seed of one cycle, from (seed, split, cycle) alone."""
-        split_key = int.from_bytes(hashlib.sha256(self.split.encode()).digest()[:8], "little")
-        return np.random.SeedSequence([self.seed, split_key, cycle])
-
-
-def scene_set_directory(root: Path, part_name: str, spec: SceneSetSpec) -> Path:
-    """Where the scene set of ``spec`` lives: ``root/<part>/<split>-<first 12 of the digest>``."""
-    return root / part_name / f"{spec.split}-{spec.digest()[:12]}"
+__all__ = [
+    "SceneSet",
+    "SceneSetSpec",
+    "content_digest",
+    "generate_scene_set",
+    "scene_set_directory",
+    "scene_set_specs",
+    "simulate_cycle",
+]
 
 
 @dataclass(frozen=True, eq=False)

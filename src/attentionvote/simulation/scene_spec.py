@@ -1,0 +1,105 @@
+"""What determines a scene set: the specification, its digest, and where the set lives."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from attentionvote.part import Part
+from attentionvote.simulation.camera import Camera, CameraSettings
+from attentionvote.simulation.drop import BinSettings, DropSettings
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class SceneSetSpec:
+    """Everything that determines the content of a scene set.
+
+    Args:
+        part_digest: ``Part.digest``.
+        split: name of the split; it enters the seeds, so splits never share a cycle.
+        cycles: number of drop cycles.
+        seed: any non-negative integer.
+        drop_counts: a cycle's pile is kept after these drops.
+        bin, camera, drop: their settings.
+        visibility_stride: visibility is measured on every so-many-th pixel.
+
+    Raises:
+        ValueError: when a setting is impossible.
+    """
+
+    part_digest: str
+    split: str
+    cycles: int
+    seed: int = 0
+    drop_counts: tuple[int, ...] = (6, 10, 14, 18, 22, 26, 30)
+    bin: BinSettings = field(default_factory=BinSettings)
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    drop: DropSettings = field(default_factory=DropSettings)
+    visibility_stride: int = 2
+    format_version: int = FORMAT_VERSION
+
+    def __post_init__(self) -> None:
+        counts = tuple(int(c) for c in self.drop_counts)
+        object.__setattr__(self, "drop_counts", counts)
+        if not self.split or not self.split.replace("_", "").replace("-", "").isalnum():
+            raise ValueError(f"split must be a word of letters, digits, - and _, got {self.split!r}")
+        if self.cycles < 1:
+            raise ValueError(f"cycles must be at least 1, got {self.cycles}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+        if not counts or counts[0] < 1 or counts[-1] > 200 or list(counts) != sorted(set(counts)):
+            raise ValueError(f"drop_counts must be increasing numbers within 1..200, got {list(counts)}")
+        if not 1 <= self.visibility_stride <= 8:
+            raise ValueError(f"visibility_stride must lie in 1..8, got {self.visibility_stride}")
+
+    def as_dict(self) -> dict:
+        """Plain JSON values, as written into the manifest."""
+        return json.loads(json.dumps(asdict(self)))
+
+    def digest(self) -> str:
+        """Sha256 of the specification."""
+        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()
+
+    def cycle_seed(self, cycle: int) -> np.random.SeedSequence:
+        """Seed of one cycle, from (seed, split, cycle) alone."""
+        split_key = int.from_bytes(hashlib.sha256(self.split.encode()).digest()[:8], "little")
+        return np.random.SeedSequence([self.seed, split_key, cycle])
+
+
+def scene_set_directory(root: Path, part_name: str, spec: SceneSetSpec) -> Path:
+    """Where the scene set of ``spec`` lives: ``root/<part>/<split>-<first 12 of the digest>``."""
+    return root / part_name / f"{spec.split}-{spec.digest()[:12]}"
+
+
+def scene_set_specs(part: Part, settings: Mapping[str, Any]) -> dict[str, SceneSetSpec]:
+    """Specification of every split, from the plain values of ``conf/simulation/*.yaml``.
+
+    Args:
+        part: the part.
+        settings: ``cycles`` (split name -> number of cycles), ``seed``, ``drop_counts``, ``visibility_stride`` and the
+            sections ``bin``, ``camera`` (with ``camera.camera``, the intrinsics) and ``drop``.
+
+    Raises:
+        ValueError: on an impossible or unknown setting.
+    """
+    try:
+        rest = dict(settings)
+        cycles = dict(rest.pop("cycles"))
+        camera = dict(rest.pop("camera"))
+        common = {
+            "bin": BinSettings(**rest.pop("bin")),
+            "camera": CameraSettings(**{**camera, "camera": Camera(**camera["camera"])}),
+            "drop": DropSettings(**rest.pop("drop")),
+            **rest,
+        }
+        return {split: SceneSetSpec(part.digest, split, count, **common) for split, count in cycles.items()}
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"simulation settings must have the keys of conf/simulation/default.yaml: {error}") from error
