@@ -1,9 +1,8 @@
-"""Fixtures of the evaluation tests: parts small enough to reason about, scenes, and the check data."""
+"""Fixtures of the evaluation tests: parts small enough to reason about, scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,15 +14,6 @@ from attentionvote.part import Part
 
 BOX_FACES = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
 BOX_FACES += [[0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """The data beside the repository that is never committed."""
-    path = Path(__file__).resolve().parents[3] / "shared" / "data"
-    if not path.is_dir():
-        pytest.skip(f"the check data is not on this machine (../shared/data, looked in {path})")
-    return path
 
 
 def make_box(symmetry: Symmetry | None = None, half: tuple[float, float, float] = (0.02, 0.01, 0.06)) -> Part:

@@ -104,7 +104,7 @@ def test_curve_with_a_result_limit_divides_by_the_smaller_number():
         match(distances, scores, ALL, 1.0, result_limit=0)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(0, 9), st.integers(0, 6), st.integers(0, 2**32 - 1), st.sampled_from([None, 1, 4]))
 def test_match_and_curve_agree_with_the_slow_matching(results, truths, seed, limit):
     rng = np.random.default_rng(seed)
@@ -126,7 +126,7 @@ def test_match_and_curve_agree_with_the_slow_matching(results, truths, seed, lim
         assert (curve.true_positives[k], curve.false_positives[k]) == (len(tp), len(fp))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 2), st.floats(0, 2))
 def test_recall_grows_with_the_threshold(seed, one, other):
     rng = np.random.default_rng(seed)

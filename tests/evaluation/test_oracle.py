@@ -53,7 +53,7 @@ SIX_DIGITS = {"rtol": 0, "atol": 5.1e-7}
 
 @pytest.fixture(scope="module")
 def bunny(shared_data):
-    folder = shared_data / "sileane_bunny_sample"
+    folder = shared_data("sileane_bunny_sample")
     return folder / "poseutils.json", list(read_scene_results(folder / "gt", folder / "results").values())
 
 
@@ -98,7 +98,7 @@ def test_bunny_sample_scene_by_scene(bunny):
 
 @pytest.fixture(scope="module", params=CLASSES)
 def oracle(request, shared_data):
-    folder = shared_data / "bregier_oracle" / request.param
+    folder = shared_data(f"bregier_oracle/{request.param}")
     metric, threshold = PoseMetric.from_poseutils(folder / "poseutils.json")
     scenes = read_scene_results(folder / "gt", folder / "results")
     return request.param, metric, threshold, scenes, json.loads((folder / "expected.json").read_text())

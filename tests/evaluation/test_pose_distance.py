@@ -38,7 +38,7 @@ def element(symmetry: Symmetry, index: int, angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", SYMMETRIES)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), index=st.integers(0, 7), angle=st.floats(-4, 4))
 def test_distance_is_invariant_under_relabelling_and_a_common_motion(name, make_poses, seed, index, angle):
     symmetry = SYMMETRIES[name]

@@ -32,7 +32,7 @@ class AverageDistance:
     """ADD: mean distance of model points between two poses, least over the symmetries, metres.
 
     Finite groups are enumerated. For a body of revolution the turn that minimises the *squared* distances
-    is taken, in closed form (atan2); at poses within 10 % D the true minimum is less than 1 % lower.
+    is taken, in closed form (atan2); on a round surface the true minimum is less than 1 % lower.
 
     Args:
         points: model ``(P, 3)``, part frame, metres.
