@@ -60,9 +60,14 @@ class Part:
         if faces.ndim != 2 or faces.shape[-1] != 3 or len(faces) < 4:
             raise ValueError(f"{self.name}: faces must be (F, 3) with F >= 4, got shape {faces.shape}")
         if not np.isfinite(vertices).all():
-            raise ValueError(f"{self.name}: vertices must be finite, got {int((~np.isfinite(vertices)).sum())} NaN or inf")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise ValueError(f"{self.name}: faces must index {len(vertices)} vertices, got {faces.min()}..{faces.max()}")
+            bad = int((~np.isfinite(vertices)).sum())
+            raise ValueError(f"{self.name}: vertices must be finite, got {bad} NaN or inf")
+        low, high = faces.min(), faces.max()
+        if low < 0 or high >= len(vertices):
+            raise ValueError(f"{self.name}: faces must index {len(vertices)} vertices, got {low}..{high}")
+        a, b, c = (vertices[faces[:, i]] for i in range(3))
+        if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+            raise ValueError(f"{self.name}: the surface must have an area, got only triangles of area 0")
         if not (np.isfinite(self.diameter) and self.diameter > 0):
             raise ValueError(f"{self.name}: diameter must be positive metres, got {self.diameter}")
         object.__setattr__(self, "vertices", vertices)

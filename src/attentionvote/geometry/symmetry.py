@@ -49,13 +49,14 @@ class Symmetry:
         if self.kind not in get_args(Kind):
             raise ValueError(f"symmetry kind must be one of {', '.join(get_args(Kind))}, got {self.kind!r}")
         for name in ("axis", "flip_axis"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            given = getattr(self, name)
+            value = np.asarray(given, dtype=np.float64)
             if value.shape != (3,) or not np.isfinite(value).all() or np.linalg.norm(value) < 1e-9:
-                raise ValueError(f"symmetry {name} must be three finite numbers, not all zero, got {getattr(self, name)}")
+                raise ValueError(f"symmetry {name} must be three finite numbers, not all zero, got {given}")
             unit = value / np.linalg.norm(value)
             object.__setattr__(self, name, (float(unit[0]), float(unit[1]), float(unit[2])))
-        if self.kind in ("cyclic", "dihedral") and self.order < 2:
-            raise ValueError(f"{self.kind} symmetry must have an order of at least 2, got {self.order}")
+        if self.kind in ("cyclic", "dihedral") and (self.order < 2 or self.order != int(self.order)):
+            raise ValueError(f"{self.kind} symmetry must have a whole order of at least 2, got {self.order}")
         if self.kind == "dihedral" and abs(np.dot(self.axis, self.flip_axis)) > 1e-6:
             raise ValueError(f"flip_axis must be perpendicular to axis, got {self.flip_axis} and {self.axis}")
         object.__setattr__(self, "quaternions", tuple(tuple(float(v) for v in q) for q in self.quaternions))
@@ -65,7 +66,13 @@ class Symmetry:
     def _check_group(self) -> None:
         if not self.quaternions or any(len(q) != 4 for q in self.quaternions):
             raise ValueError("a group must list its elements as quaternions of four numbers (w, x, y, z)")
+        lengths = np.linalg.norm(self.quaternions, axis=1)
+        if not np.isfinite(lengths).all() or lengths.min() < 1e-9:
+            raise ValueError("each quaternion of a group must have finite numbers, not all zero")
         r = matrix_from_quaternion(self.quaternions)
+        apart = np.abs(r[:, None] - r).max((-2, -1)) + np.eye(len(r))
+        if apart.min() < 1e-5:
+            raise ValueError("a group must list each rotation once (q and -q are the same rotation)")
         products = np.einsum("aij,bjk->abik", r, r).reshape(-1, 9)
         nearest = np.abs(products[:, None] - r.reshape(1, -1, 9)).max(-1).min(-1)
         if nearest.max() > 1e-5:
