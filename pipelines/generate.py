@@ -30,7 +30,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     with configuring(f"object {cfg.object.name}"):
         part = instantiate(cfg.object)
     with configuring():
-        specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation))  # type: ignore[arg-type]
+        specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation))
     unknown = [split for split in cfg.splits if split not in specs]
     if unknown or not cfg.splits:
         raise ConfigurationError(f"splits must be among {', '.join(specs)}; got {list(cfg.splits)}")

@@ -47,6 +47,12 @@ class SceneSet:
     spec_digest: str
     cycles: int
 
+    @staticmethod
+    def is_complete(directory: Path) -> bool:
+        """Whether ``directory`` holds a complete set."""
+        manifest = _read_manifest(directory)
+        return manifest is not None and manifest["content_digest"] is not None
+
     @classmethod
     def open(cls, directory: Path) -> SceneSet:
         """Open the set in ``directory``.
