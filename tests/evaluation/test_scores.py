@@ -83,11 +83,11 @@ def test_evaluate_measures_rotation_up_to_the_symmetry(box):
 
 
 def test_evaluate_puts_a_visible_fraction_on_the_edge_into_the_upper_bin(box):
-    occlusion = [0.5, 0.4, 0.3, 0.2, 0.1, 1 - 0.7, 0.51]
-    poses = np.stack([moved(500 * k, 0, 0) for k in range(7)])
-    metrics = evaluate([SceneResult(poses[[1, 5]], [1.0, 1.0], poses, occlusion)], box(), add=False)
+    occlusion = [0.5, 0.4, 0.3, 0.2, 0.1, 1 - 0.7, 0.51, 0.0]
+    poses = np.stack([moved(500 * k, 0, 0) for k in range(8)])
+    metrics = evaluate([SceneResult(poses[[1, 5, 7]], np.ones(3), poses, occlusion)], box(), add=False)
     names = ("50_60", "60_70", "70_80", "80_90", "90_100")
-    assert [metrics[f"recall_visible_{name}"] for name in names] == [0, 1, 0.5, 0, 0]
+    assert [metrics[f"recall_visible_{name}"] for name in names] == [0, 1, 0.5, 0, 0.5]
 
 
 def test_evaluate_uses_the_metric_it_is_given(box):
