@@ -7,25 +7,10 @@ tests and takes its place where no compiler is found. Both return the same indic
 
 from __future__ import annotations
 
-import ctypes
-import functools
-import hashlib
-import os
-import platform
-import shutil
-import subprocess
-import tempfile
-import warnings
-from importlib import resources
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.geometry import sampling_reference
-
-_FLAGS = ("-O3", "-std=c99", "-ffinite-math-only", "-fno-signed-zeros", "-shared", "-fPIC")
-
+from attentionvote.geometry import native, sampling_reference
 
 def farthest_point_order(points: NDArray[np.float32], count: int) -> NDArray[np.int64]:
     """Indices ``(count,)`` of points so that each is the farthest from all before it; starts at index 0.
@@ -43,11 +28,11 @@ def farthest_point_order(points: NDArray[np.float32], count: int) -> NDArray[np.
     xyz = _checked("points", points)
     if not 1 <= count <= len(xyz):
         raise ValueError(f"count must lie in 1..{len(xyz)} (the number of points), got {count}")
-    library = compiled_library()
+    library = native.load("attentionvote.geometry", "pointops.c")
     if library is None:
         return sampling_reference.farthest_point_order(xyz, count)
     order = np.empty(count, dtype=np.int32)
-    _call(library.farthest_point_order, xyz, len(xyz), count, order)
+    native.call(library.farthest_point_order, xyz, len(xyz), count, order)
     return order.astype(np.int64)
 
 
@@ -77,12 +62,12 @@ def ball_query(
         raise ValueError(f"radius must be a positive number of metres, got {radius}")
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
-    library = compiled_library()
+    library = native.load("attentionvote.geometry", "pointops.c")
     if library is None:
         return sampling_reference.ball_query(xyz, middle, radius, count)
     neighbors = np.empty((len(middle), count), dtype=np.int32)
     found = np.empty(len(middle), dtype=np.int32)
-    _call(library.ball_query, xyz, len(xyz), middle, len(middle), ctypes.c_float(radius), count, neighbors, found)
+    native.call(library.ball_query, xyz, len(xyz), middle, len(middle), float(radius), count, neighbors, found)
     return neighbors.astype(np.int64), found.astype(np.int64)
 
 
@@ -99,55 +84,13 @@ def three_nearest(
         Indices ``(T, 3)`` and distances ``(T, 3)`` in metres.
     """
     xyz, goal = _checked("sources", sources), _checked("targets", targets, empty=True)
-    library = compiled_library()
+    library = native.load("attentionvote.geometry", "pointops.c")
     if library is None:
         return sampling_reference.three_nearest(xyz, goal)
     neighbors = np.empty((len(goal), 3), dtype=np.int32)
     squared = np.empty((len(goal), 3), dtype=np.float32)
-    _call(library.three_nearest, xyz, len(xyz), goal, len(goal), neighbors, squared)
+    native.call(library.three_nearest, xyz, len(xyz), goal, len(goal), neighbors, squared)
     return neighbors.astype(np.int64), np.sqrt(squared)
-
-
-@functools.cache
-def compiled_library() -> ctypes.CDLL | None:
-    """The compiled operators, or None (with one warning) where there is no C compiler."""
-    source = resources.files("attentionvote.geometry").joinpath("pointops.c").read_bytes()
-    key = hashlib.sha256(b"\0".join([source, *(f.encode() for f in _FLAGS), platform.machine().encode()])).hexdigest()
-    path = cache_folder() / f"pointops-{key[:16]}.so"
-    if not path.exists():
-        compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-        if compiler is None:
-            warnings.warn(
-                "no C compiler found, point operators run in numpy and are about 50 times slower: install gcc",
-                stacklevel=2,
-            )
-            return None
-        _compile(compiler, source, path)
-    return ctypes.CDLL(str(path))
-
-
-def cache_folder() -> Path:
-    """Where things computed once per machine are kept: ``ATTENTIONVOTE_CACHE``, else the user's cache folder."""
-    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "attentionvote"
-    return Path(os.environ.get("ATTENTIONVOTE_CACHE", default))
-
-
-def _compile(compiler: str, source: bytes, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        c_file, library = Path(folder, "pointops.c"), Path(folder, "pointops.so")
-        c_file.write_bytes(source)
-        command = [compiler, *_FLAGS, str(c_file), "-o", str(library), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise OSError(f"{compiler} could not compile the point operators: {done.stderr.strip()[:500]}")
-        library.replace(path)  # atomic: two processes may compile at once
-
-
-def _call(function: ctypes._FuncPointer, *arguments: object) -> None:
-    pointers = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
-    if function(*pointers):
-        raise MemoryError("the point operators ran out of memory")
 
 
 def _checked(name: str, points: NDArray, empty: bool = False) -> NDArray[np.float32]:

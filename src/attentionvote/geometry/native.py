@@ -1,0 +1,100 @@
+"""Compiling the project's small C files once per machine and calling them through ctypes.
+
+No torch headers, no CUDA, no build step at installation: the first use compiles into the user's cache folder.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+import warnings
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+# Never -ffast-math: in a shared object it makes GCC flush subnormals to zero in the whole process. The running
+# maxima vectorise only under -ffinite-math-only (speed reference, "own C operators").
+PORTABLE = ("-O3", "-std=gnu99", "-ffinite-math-only", "-fno-signed-zeros", "-shared", "-fPIC")
+
+
+@functools.cache
+def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
+    """The compiled library of a C file that lies in a package, or None (with one warning) without a C compiler.
+
+    Args:
+        package: dotted name of the package.
+        file: name of the C file in it.
+        tuned: compile for exactly this processor; results may differ in the last bit between machines.
+
+    Raises:
+        OSError: when the compiler refuses the file, with the compiler's words.
+    """
+    flags = (*PORTABLE, "-march=native") if tuned else PORTABLE
+    source = resources.files(package).joinpath(file).read_bytes()
+    machine = _processor() if tuned else platform.machine()
+    key = hashlib.sha256("\0".join([source.decode(), *flags, machine]).encode()).hexdigest()
+    path = cache_folder() / f"{Path(file).stem}-{key[:16]}.so"
+    if not path.exists():
+        compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+        if compiler is None:
+            warnings.warn(f"no C compiler found, {file} is replaced by slow Python: install gcc", stacklevel=2)
+            return None
+        _compile(compiler, flags, source, path)
+    return ctypes.CDLL(str(path))
+
+
+def call(function: ctypes._NamedFuncPointer, *arguments: object) -> None:
+    """Call a C function that returns 0 for success and 1 for no memory; arrays and None go as pointers.
+
+    The interpreter's lock is released during the call, so several threads may work at once.
+    """
+    converted = []
+    for argument in arguments:
+        if argument is None:
+            converted.append(ctypes.c_void_p(None))
+        elif isinstance(argument, np.ndarray):
+            converted.append(ctypes.c_void_p(argument.ctypes.data))
+        elif isinstance(argument, float):
+            converted.append(ctypes.c_float(argument))
+        else:
+            converted.append(argument)
+    if function(*converted):
+        raise MemoryError(f"{function.__name__} ran out of memory")
+
+
+def long(value: int) -> ctypes.c_int64:
+    """A 64-bit argument; plain integers are passed as 32-bit ones."""
+    return ctypes.c_int64(value)
+
+
+def cache_folder() -> Path:
+    """Where things computed once per machine are kept: ``ATTENTIONVOTE_CACHE``, else the user's cache folder."""
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "attentionvote"
+    return Path(os.environ.get("ATTENTIONVOTE_CACHE", default))
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor() + platform.machine()
+    return "\n".join(line for line in lines if line.startswith(("model name", "flags", "Features")))
+
+
+def _compile(compiler: str, flags: tuple[str, ...], source: bytes, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        c_file, library = Path(folder, "source.c"), Path(folder, "library.so")
+        c_file.write_bytes(source)
+        command = [compiler, *flags, str(c_file), "-o", str(library), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise OSError(f"{compiler} could not compile {path.stem}: {done.stderr.strip()[:500]}")
+        library.replace(path)  # atomic: two processes may compile at once

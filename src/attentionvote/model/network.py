@@ -1,0 +1,252 @@
+"""AttentionVote: points and normals in, poses of all instances out (paper section 3, Fig. 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from attentionvote.model.backbone import Backbone
+from attentionvote.model.fusion import AttentionVoting
+from attentionvote.model.layers import shared_mlp
+from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
+from attentionvote.model.proposals import Peaks, gather_votes, heatmap_peaks
+from attentionvote.model.refinement import Refined, Refiner
+from attentionvote.model.rotation import matrix_from_quaternion, matrix_from_six, quaternion_from_matrix, unit_quaternion
+
+
+class Votes(NamedTuple):
+    """One vote a seed: where the centre of its instance is (section 3.1).
+
+    Attributes:
+        seed_index: ``(batch, M)`` index of the seed among the sample's points.
+        xyz: ``(batch, M, 3)`` voted centre, metres.
+        feature: ``(batch, M, F)``.
+        rotation: ``(batch, M, 3, 3)`` rotation voted by the auxiliary head, None without one.
+    """
+
+    seed_index: Tensor
+    xyz: Tensor
+    feature: Tensor
+    rotation: Tensor | None
+
+
+class Poses(NamedTuple):
+    """Poses of proposals, one row each.
+
+    Attributes:
+        center: ``(rows, 3)`` metres, the part's origin in the camera frame.
+        rotation: ``(rows, 3, 3)`` ``camera_from_part``.
+        quaternion: ``(rows, 4)`` unit quaternion with the sign the network gave it (Eq. 6 needs it).
+        class_logits: ``(rows, classes)``.
+        score: ``(rows,)`` logarithm of the confidence c (Eq. 10), or the logit of the expected quality.
+        feature: ``(rows, width)``.
+    """
+
+    center: Tensor
+    rotation: Tensor
+    quaternion: Tensor
+    class_logits: Tensor
+    score: Tensor
+    feature: Tensor
+
+
+class Predictions(NamedTuple):
+    """What the network answers; field names are the names of the exported graph's outputs.
+
+    Attributes:
+        vote_xyz: ``(batch, M, 3)`` voted centres.
+        center_seed: ``(batch, K, 3)`` heatmap peaks, hottest first.
+        peak_heat: ``(batch, K)`` heat; 0 where there are fewer than K peaks.
+        center: ``(batch, K, 3)`` metres.
+        quaternion: ``(batch, K, 4)`` unit, w first.
+        class_logits: ``(batch, K, classes)``.
+        confidence: ``(batch, K)``, positive; higher is better.
+    """
+
+    vote_xyz: Tensor
+    center_seed: Tensor
+    peak_heat: Tensor
+    center: Tensor
+    quaternion: Tensor
+    class_logits: Tensor
+    confidence: Tensor
+
+
+class AttentionVote(nn.Module):
+    """The network. Lengths are given as fractions of the diameter D, so one preset fits parts of every size.
+
+    Args:
+        diameter: D of the (largest) part in metres.
+        box: lowest and highest corner of the part in its own frame, metres; only the refinement looks at it.
+        centers, neighbors, widths, propagation, residual: the backbone (see ``Layout`` and ``Backbone``).
+        base_radius: r in metres; None takes ``radius_fraction`` x D. Levels have r, 2r, 3r and 6r.
+        voxel_size: of the heatmap in metres; None takes ``voxel_fraction`` x D.
+        voting_radius: radius in which votes are gathered, metres; None takes r. May be set during training.
+        voting: hidden widths of the voting module.
+        vote_rotation: whether every vote also predicts its instance's rotation: dense supervision, not in the paper.
+        proposals: K.
+        peak_window, center_seed: see ``heatmap_peaks``.
+        gathered: H, votes gathered for a proposal.
+        fusion: widths of both branches of the attention (section 3.5: 128, 128, 128).
+        head: hidden widths of the head.
+        classes: NC.
+        rotation: ``quaternion`` (the paper's) or ``six`` (Gram-Schmidt of two vectors).
+        confidence: ``exponential`` (c = exp(s), Eq. 10) or ``quality`` (c = sigmoid(s), the expected quality).
+        refinement: arguments of ``Refiner`` (points, widths, head), None for the paper's form.
+        refinement_steps: corrections made at inference.
+    """
+
+    def __init__(
+        self,
+        diameter: float,
+        box: Sequence[Sequence[float]],
+        centers: Sequence[int],
+        neighbors: Sequence[int],
+        widths: Sequence[Sequence[int]],
+        propagation: Sequence[int],
+        residual: bool,
+        radius_fraction: float,
+        voxel_fraction: float,
+        voting: Sequence[int],
+        proposals: int,
+        gathered: int,
+        fusion: Sequence[int],
+        head: Sequence[int],
+        base_radius: float | None = None,
+        voxel_size: float | None = None,
+        voting_radius: float | None = None,
+        vote_rotation: bool = False,
+        peak_window: int = 1,
+        center_seed: Literal["voxel", "mean"] = "voxel",
+        classes: int = 1,
+        rotation: Literal["quaternion", "six"] = "quaternion",
+        confidence: Literal["exponential", "quality"] = "exponential",
+        refinement: dict | None = None,
+        refinement_steps: int = 2,
+    ) -> None:
+        super().__init__()
+        self.diameter = diameter
+        radius = base_radius or radius_fraction * diameter
+        self.voxel_size = voxel_size or voxel_fraction * diameter
+        self.voting_radius = voting_radius or radius
+        self.layout = Layout(tuple(centers), tuple(neighbors), tuple(radius * k for k in (1, 2, 3, 6)))
+        self.proposals, self.gathered, self.classes = proposals, gathered, classes
+        self.peak_window, self.center_seed = peak_window, center_seed
+        self.rotation, self.confidence, self.refinement_steps = rotation, confidence, refinement_steps
+        self.backbone = Backbone(self.layout, widths, propagation, residual)
+        width = self.backbone.width
+        self.vote = shared_mlp(width, voting, 3 + width)
+        rotation_size = 4 if rotation == "quaternion" else 6
+        self.vote_rotation = nn.Linear(width, rotation_size) if vote_rotation else None
+        self.fusion = AttentionVoting(width, fusion)
+        self.head = shared_mlp(self.fusion.width, head)
+        self.output = nn.Linear(head[-1], 3 + rotation_size + classes + 1)
+        nn.init.normal_(self.vote[-1].weight, std=0.01)
+        self.refiner: Refiner | None = None
+        self.refined_score: nn.Linear | None = None
+        if refinement is not None:
+            self.refiner = Refiner(diameter, box, context=head[-1], **refinement)
+            self.refined_score = nn.Linear(self.refiner.width, 1)
+
+    def cast_votes(
+        self,
+        points: Float[Tensor, "batch points 3"],
+        normals: Float[Tensor, "batch points 3"],
+        found: Neighborhoods,
+    ) -> Votes:
+        """Seeds and their votes (section 3.1); offsets leave the network in units of half a diameter."""
+        seed_xyz, seed_feature = self.backbone(points, normals, found)
+        residual = self.vote(seed_feature)
+        xyz = seed_xyz + residual[..., :3] * (0.5 * self.diameter)
+        feature = seed_feature + residual[..., 3:]
+        rotation = None if self.vote_rotation is None else self._matrix(self.vote_rotation(feature))
+        return Votes(found.order[:, : self.layout.seeds], xyz, feature, rotation)
+
+    def find_peaks(self, votes: Votes) -> Peaks:
+        """The K hottest peaks of the votes' heatmap (section 3.2); positions carry no gradient to the votes."""
+        return heatmap_peaks(votes.xyz.detach(), self.voxel_size, self.proposals, self.peak_window, self.center_seed)
+
+    def regress(self, votes: Votes, peaks: Peaks, rows: Int[Tensor, "rows"] | None = None) -> Poses:
+        """Poses of proposals from the votes around them (sections 3.3, 3.4).
+
+        Args:
+            rows: flat indices into ``(batch, K)`` of the proposals wanted; all when None.
+        """
+        batch, proposals, _ = peaks.center_seed.shape
+        index = gather_votes(votes.xyz.detach(), peaks.center_seed, self.voting_radius, self.gathered)
+        first_row = torch.arange(batch, device=index.device)[:, None, None] * votes.xyz.shape[1]
+        index = (index + first_row).flatten(0, 1)
+        seed = peaks.center_seed.flatten(0, 1)
+        if rows is not None:
+            index, seed = index[rows], seed[rows]
+        offsets = (votes.xyz.flatten(0, 1)[index] - seed[:, None]) / self.voting_radius
+        fused = self.fusion(offsets, votes.feature.flatten(0, 1), index)
+        feature = self.head(fused)
+        out = self.output(feature)
+        center = seed + out[:, :3] * (0.1 * self.diameter)
+        raw = out[:, 3 : -1 - self.classes]
+        rotation = self._matrix(raw)
+        quaternion = unit_quaternion(raw) if self.rotation == "quaternion" else quaternion_from_matrix(rotation)
+        return Poses(center, rotation, quaternion, out[:, -1 - self.classes : -1], out[:, -1], feature)
+
+    def refine(
+        self,
+        points: Float[Tensor, "batch points 3"],
+        normals: Float[Tensor, "batch points 3"],
+        sample: Int[Tensor, "rows"],
+        poses: Poses,
+    ) -> Poses:
+        """One correction of the poses with a new score; ``sample`` names each row's sample of the batch."""
+        if self.refiner is None or self.refined_score is None:
+            return poses
+        better: Refined = self.refiner(points, normals, sample, poses.center, poses.rotation, poses.feature)
+        score = self.refined_score(better.feature)[:, 0]
+        quaternion = quaternion_from_matrix(better.rotation)
+        return Poses(better.center, better.rotation, quaternion, poses.class_logits, score, poses.feature)
+
+    def forward(
+        self,
+        points: Float[Tensor, "batch points 3"],
+        normals: Float[Tensor, "batch points 3"],
+        found: Neighborhoods | None = None,
+    ) -> Predictions:
+        """Poses of all instances.
+
+        Args:
+            points: metres, camera frame, in random order.
+            normals: unit, towards the camera.
+            found: neighbourhoods when they are known already.
+        """
+        if found is None:
+            found = find_batch(points, self.layout)
+        votes = self.cast_votes(points, normals, found)
+        peaks = self.find_peaks(votes)
+        poses = self.regress(votes, peaks)
+        batch, k = peaks.heat.shape
+        sample = torch.arange(batch, device=points.device).repeat_interleave(k)
+        for _ in range(self.refinement_steps if self.refiner is not None else 0):
+            poses = self.refine(points, normals, sample, poses)
+
+        def shaped(rows: Tensor) -> Tensor:
+            return rows.view(batch, k, *rows.shape[1:])
+
+        return Predictions(
+            votes.xyz,
+            peaks.center_seed,
+            peaks.heat,
+            shaped(poses.center),
+            shaped(poses.quaternion),
+            shaped(poses.class_logits),
+            shaped(self.confidence_of(poses.score)),
+        )
+
+    def confidence_of(self, score: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows"]:
+        """Confidence of a score: exp(s) with s clamped to +-8 (Eq. 10), or sigmoid(s)."""
+        return torch.sigmoid(score) if self.confidence == "quality" else score.clamp(-8, 8).exp()
+
+    def _matrix(self, raw: Tensor) -> Tensor:
+        return matrix_from_quaternion(raw) if self.rotation == "quaternion" else matrix_from_six(raw)

@@ -1,0 +1,259 @@
+/* The arithmetic of a set abstraction on a CPU: shared MLP over the neighbours of a centre, then the maximum.
+ *
+ * Everything of one centre stays in the first-level cache; the backward pass recomputes the hidden layers and uses
+ * that the maximum hands its gradient to one neighbour a channel, so the widest layer costs almost nothing there.
+ * Called through ctypes by model/pooled_mlp.py, whose reference formulation is the oracle of the tests. Weights of
+ * layer l: forward takes them as (in, out) rows, backward also as (out, in). All widths are multiples of 8.
+ */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+typedef float v8 __attribute__((vector_size(32), aligned(4)));
+#define V(p) (*(v8 *)(p))
+#define C(p) (*(const v8 *)(p))
+
+typedef int32_t i8 __attribute__((vector_size(32)));
+
+static v8 relu_of(v8 s) { return (v8)((s > (v8){0}) & (i8)s); }
+
+/* out[rows][n_out] = in[rows][n_in] * weights[n_in][n_out] + bias, optionally ReLU. */
+static void linear(const float *in, int rows, int n_in, const float *weights, const float *bias, int n_out, float *out,
+                   int relu) {
+    const v8 zero = {0};
+    for (int o = 0; o < n_out; o += 16) {
+        const int wide = o + 8 < n_out;
+        for (int r = 0; r < rows; r += 4) {
+            const int left = rows - r;
+            const float *x0 = in + (int64_t)r * n_in, *x1 = left > 1 ? x0 + n_in : x0;
+            const float *x2 = left > 2 ? x0 + 2 * n_in : x0, *x3 = left > 3 ? x0 + 3 * n_in : x0;
+            const v8 b0 = C(bias + o), b1 = wide ? C(bias + o + 8) : zero;
+            v8 a00 = b0, a01 = b1, a10 = b0, a11 = b1, a20 = b0, a21 = b1, a30 = b0, a31 = b1;
+            const float *w = weights + o;
+            if (wide)
+                for (int i = 0; i < n_in; i++, w += n_out) {
+                    const v8 w0 = C(w), w1 = C(w + 8);
+                    a00 += x0[i] * w0, a01 += x0[i] * w1, a10 += x1[i] * w0, a11 += x1[i] * w1;
+                    a20 += x2[i] * w0, a21 += x2[i] * w1, a30 += x3[i] * w0, a31 += x3[i] * w1;
+                }
+            else
+                for (int i = 0; i < n_in; i++, w += n_out) {
+                    const v8 w0 = C(w);
+                    a00 += x0[i] * w0, a10 += x1[i] * w0, a20 += x2[i] * w0, a30 += x3[i] * w0;
+                }
+            float *y = out + (int64_t)r * n_out + o;
+            if (relu)
+                a00 = relu_of(a00), a01 = relu_of(a01), a10 = relu_of(a10), a11 = relu_of(a11), a20 = relu_of(a20),
+                a21 = relu_of(a21), a30 = relu_of(a30), a31 = relu_of(a31);
+            V(y) = a00;
+            if (left > 1) V(y + n_out) = a10;
+            if (left > 2) V(y + 2 * n_out) = a20;
+            if (left > 3) V(y + 3 * n_out) = a30;
+            if (!wide) continue;
+            V(y + 8) = a01;
+            if (left > 1) V(y + n_out + 8) = a11;
+            if (left > 2) V(y + 2 * n_out + 8) = a21;
+            if (left > 3) V(y + 3 * n_out + 8) = a31;
+        }
+    }
+}
+
+static void axpy(float a, const float *x, float *y, int n) {
+    for (int i = 0; i < n; i += 8) V(y + i) += a * C(x + i);
+}
+
+/* Hidden layers of one centre: hidden[l] for l < layers - 1. The first adds the projected features of the level below. */
+static void hidden_layers(const float *geometry, int k, int channels, const float *projected, const int64_t *index,
+                          int layers, const int32_t *widths, const float *const *weights, const float *const *biases,
+                          float *const *hidden) {
+    linear(geometry, k, channels, weights[0], biases[0], widths[0], hidden[0], projected == NULL);
+    if (projected)
+        for (int j = 0; j < k; j++) {
+            const float *u = projected + index[j] * widths[0];
+            float *h = hidden[0] + (int64_t)j * widths[0];
+            for (int i = 0; i < widths[0]; i += 8) V(h + i) = relu_of(C(h + i) + C(u + i));
+        }
+    for (int l = 1; l < layers - 1; l++)
+        linear(hidden[l - 1], k, widths[l - 1], weights[l], biases[l], widths[l], hidden[l], 1);
+}
+
+/* out[c][width] = max over neighbours, winner[c][width] = which neighbour. */
+int pooled_forward(const float *geometry, int64_t from, int64_t to, int32_t k, int32_t channels, const float *projected,
+                   const int64_t *index, int32_t layers, const int32_t *widths, const float *const *weights,
+                   const float *const *biases, float *out, uint8_t *winner) {
+    float *hidden[8], *last;
+    const int top = widths[layers - 1];
+    size_t total = (size_t)k * top;
+    for (int l = 0; l < layers - 1; l++) total += (size_t)k * widths[l];
+    float *memory = malloc(sizeof(float) * total);
+    if (!memory) return 1;
+    last = memory;
+    float *next = memory + (size_t)k * top;
+    for (int l = 0; l < layers - 1; next += (size_t)k * widths[l], l++) hidden[l] = next;
+    for (int64_t c = from; c < to; c++) {
+        hidden_layers(geometry + c * k * channels, k, channels, projected, index ? index + c * k : NULL, layers, widths,
+                      weights, biases, hidden);
+        linear(hidden[layers - 2], k, widths[layers - 2], weights[layers - 1], biases[layers - 1], top, last, 0);
+        float *o = out + c * top;
+        uint8_t *win = winner + c * top;
+        memcpy(o, last, sizeof(float) * top);
+        memset(win, 0, top);
+        for (int j = 1; j < k; j++) {
+            const float *row = last + (int64_t)j * top;
+            for (int i = 0; i < top; i++) {
+                win[i] = row[i] > o[i] ? (uint8_t)j : win[i];
+                o[i] = row[i] > o[i] ? row[i] : o[i];
+            }
+        }
+    }
+    free(memory);
+    return 0;
+}
+
+/* Adds to grad_weights[l] (out, in), grad_biases[l] and grad_projected; transposed[l] is (out, in). */
+int pooled_backward(const float *geometry, int64_t from, int64_t to, int32_t k, int32_t channels, const float *projected,
+                    const int64_t *index, int32_t layers, const int32_t *widths, const float *const *weights,
+                    const float *const *biases, const float *const *transposed, const uint8_t *winner,
+                    const float *grad_out, float *const *grad_weights, float *const *grad_biases,
+                    float *grad_projected) {
+    float *hidden[8], *grads[8];
+    const int top = widths[layers - 1], n = layers - 1;
+    size_t total = 0;
+    for (int l = 0; l < n; l++) total += 2 * (size_t)k * widths[l];
+    float *memory = malloc(sizeof(float) * total);
+    uint8_t *touched = malloc((size_t)k);
+    if (!memory || !touched) {
+        free(memory), free(touched);
+        return 1;
+    }
+    float *next = memory;
+    for (int l = 0; l < n; next += 2 * (size_t)k * widths[l], l++)
+        hidden[l] = next, grads[l] = next + (size_t)k * widths[l];
+    for (int64_t c = from; c < to; c++) {
+        const float *g = geometry + c * k * channels, *grad = grad_out + c * top;
+        const uint8_t *win = winner + c * top;
+        hidden_layers(g, k, channels, projected, index ? index + c * k : NULL, layers, widths, weights, biases, hidden);
+        memset(touched, 0, (size_t)k);
+        memset(grads[n - 1], 0, sizeof(float) * (size_t)k * widths[n - 1]);
+        for (int i = 0; i < top; i++) {
+            const int64_t w = win[i];
+            if (grad[i] == 0.0f) continue;
+            touched[w] = 1;
+            axpy(grad[i], hidden[n - 1] + w * widths[n - 1], grad_weights[n] + (int64_t)i * widths[n - 1], widths[n - 1]);
+            axpy(grad[i], transposed[n] + (int64_t)i * widths[n - 1], grads[n - 1] + w * widths[n - 1], widths[n - 1]);
+            grad_biases[n][i] += grad[i];
+        }
+        for (int j = 0; j < k; j++) {
+            if (!touched[j]) continue;
+            for (int l = n - 1; l >= 0; l--) {
+                const int width = widths[l];
+                float *gh = grads[l] + (int64_t)j * width;
+                const float *h = hidden[l] + (int64_t)j * width;
+                for (int i = 0; i < width; i++) gh[i] = h[i] > 0.0f ? gh[i] : 0.0f;
+                for (int i = 0; i < width; i += 8) V(grad_biases[l] + i) += C(gh + i);
+                if (l == 0) break;
+                const float *below = hidden[l - 1] + (int64_t)j * widths[l - 1];
+                float *gb = grads[l - 1] + (int64_t)j * widths[l - 1];
+                memset(gb, 0, sizeof(float) * widths[l - 1]);
+                for (int i = 0; i < width; i++) {
+                    if (gh[i] == 0.0f) continue;
+                    axpy(gh[i], below, grad_weights[l] + (int64_t)i * widths[l - 1], widths[l - 1]);
+                    axpy(gh[i], transposed[l] + (int64_t)i * widths[l - 1], gb, widths[l - 1]);
+                }
+            }
+            const float *gh = grads[0] + (int64_t)j * widths[0];
+            if (grad_projected) axpy(1.0f, gh, grad_projected + index[c * k + j] * widths[0], widths[0]);
+            /* The first layer's gradient is kept as (in, out): its input is narrower than a vector. */
+            for (int i = 0; i < channels; i++) axpy(g[(int64_t)j * channels + i], gh, grad_weights[0] + (int64_t)i * widths[0], widths[0]);
+        }
+    }
+    free(memory), free(touched);
+    return 0;
+}
+
+/* Ten channels of every neighbour: offset / radius (3), its normal (3), distance / radius, and the three cosines of
+ * the point pair feature. An index is within its sample: sample s of a level owns rows s * stride of points. */
+int pair_features(const float *points, const float *normals, const float *centers, const float *center_normals,
+                  const int64_t *index, int64_t from, int64_t to, int32_t k, float radius, float *out) {
+    const float inverse = 1.0f / radius;
+    for (int64_t c = from; c < to; c++) {
+        const float *p = centers + 3 * c, *m = center_normals + 3 * c;
+        for (int j = 0; j < k; j++) {
+            const int64_t i = index[c * k + j];
+            const float *q = points + 3 * i, *n = normals + 3 * i;
+            const float x = q[0] - p[0], y = q[1] - p[1], z = q[2] - p[2];
+            const float length = sqrtf(x * x + y * y + z * z), s = 1.0f / (length + 1e-6f);
+            float *o = out + (c * k + j) * 10;
+            o[0] = x * inverse, o[1] = y * inverse, o[2] = z * inverse;
+            o[3] = n[0], o[4] = n[1], o[5] = n[2];
+            o[6] = length * inverse;
+            o[7] = (m[0] * x + m[1] * y + m[2] * z) * s;
+            o[8] = (n[0] * x + n[1] * y + n[2] * z) * s;
+            o[9] = m[0] * n[0] + m[1] * n[1] + m[2] * n[2];
+        }
+    }
+    return 0;
+}
+
+/* The first `count` points in index order that lie in a part's box (low..high, part frame) when the part is at pose q,
+ * with their normals, in the part frame and in units of `scale`: out[q][count][6]. Fewer are repeated in turn; none
+ * gives zeros. found[q] is the number of different points. */
+int points_in_box(const float *points, const float *normals, int32_t n, const int64_t *sample, const float *center,
+                  const float *rotation, int64_t from, int64_t to, const float *low, const float *high, float scale,
+                  int32_t count, float *out, int32_t *found) {
+    for (int64_t q = from; q < to; q++) {
+        const float *p = points + 3 * n * sample[q], *m = normals + 3 * n * sample[q];
+        const float *c = center + 3 * q, *r = rotation + 9 * q;
+        float *o = out + q * count * 6;
+        int32_t have = 0;
+        for (int32_t i = 0; i < n && have < count; i++) {
+            const float x = p[3 * i] - c[0], y = p[3 * i + 1] - c[1], z = p[3 * i + 2] - c[2];
+            const float u = r[0] * x + r[3] * y + r[6] * z;
+            const float v = r[1] * x + r[4] * y + r[7] * z;
+            const float w = r[2] * x + r[5] * y + r[8] * z;
+            if (u < low[0] || u > high[0] || v < low[1] || v > high[1] || w < low[2] || w > high[2]) continue;
+            const float *k = m + 3 * i;
+            float *e = o + 6 * have++;
+            e[0] = u * scale, e[1] = v * scale, e[2] = w * scale;
+            for (int a = 0; a < 3; a++) e[3 + a] = r[a] * k[0] + r[3 + a] * k[1] + r[6 + a] * k[2];
+        }
+        found[q] = have;
+        if (have == 0) memset(o, 0, sizeof(float) * 6 * count);
+        else
+            for (int32_t i = have; i < count; i++) memcpy(o + 6 * i, o + 6 * (i % have), sizeof(float) * 6);
+    }
+    return 0;
+}
+
+/* Heat of every vote's voxel, whether a hotter (or as hot and earlier) vote lies within `window` voxels, and the
+ * heat-weighted mean of the votes in the 3x3x3 voxels around it. One sample of m votes. */
+int heatmap(const float *votes, int32_t m, float voxel, int32_t window, float center, float side, float tie, float *heat,
+            float *beaten, float *mean) {
+    int32_t *v = malloc(sizeof(int32_t) * 3 * (size_t)m);
+    if (!v) return 1;
+    const float weights[4] = {center, center * side, center * side * side, center * side * side * side};
+    for (int32_t i = 0; i < 3 * m; i++) v[i] = (int32_t)floorf(votes[i] / voxel);
+    for (int32_t i = 0; i < m; i++) {
+        float sum = 0, s[3] = {0, 0, 0};
+        for (int32_t j = 0; j < m; j++) {
+            const int32_t x = abs(v[3 * i] - v[3 * j]), y = abs(v[3 * i + 1] - v[3 * j + 1]), z = abs(v[3 * i + 2] - v[3 * j + 2]);
+            if ((x | y | z) > 1) continue;
+            const float w = weights[x + y + z];
+            sum += w;
+            for (int a = 0; a < 3; a++) s[a] += w * (votes[3 * j + a] - votes[3 * i + a]);
+        }
+        heat[i] = sum;
+        for (int a = 0; a < 3; a++) mean[3 * i + a] = votes[3 * i + a] + s[a] / sum;
+    }
+    for (int32_t i = 0; i < m; i++) {
+        beaten[i] = 0;
+        for (int32_t j = 0; j < m; j++) {
+            if (abs(v[3 * i] - v[3 * j]) > window || abs(v[3 * i + 1] - v[3 * j + 1]) > window || abs(v[3 * i + 2] - v[3 * j + 2]) > window) continue;
+            const float ahead = heat[j] - heat[i];
+            if (ahead > tie || (ahead >= -tie && j < i)) beaten[i] = 1;
+        }
+    }
+    free(v);
+    return 0;
+}

@@ -1,0 +1,119 @@
+"""Centre seeds from votes: a heatmap without a grid, and its local peaks (paper section 3.2).
+
+The paper counts votes in voxels and smooths with a sparse 3x3x3 Gaussian. Evaluated at occupied voxels only, that
+is a sum over pairs of votes of a weight that depends on the integer difference of their voxels: M x M small
+integers, no sparse-convolution library, no extent to choose, standard ONNX operators.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from attentionvote.geometry import native
+
+# The paper's kernel: 3x3x3, sigma one voxel, sum one: centre 0.0923, face 0.0560, edge 0.0339, corner 0.0206.
+_SIDE = math.exp(-0.5)
+_CENTER = 1.0 / (1.0 + 2.0 * _SIDE) ** 3
+_TIE = 1e-4  # heats closer than this are equal; different sums of kernel weights differ by more than 0.006
+
+
+class Peaks(NamedTuple):
+    """Local peaks of the heatmap, hottest first; places beyond the last peak have heat 0.
+
+    Attributes:
+        center_seed: ``(batch, K, 3)`` metres.
+        heat: ``(batch, K)`` smoothed vote count.
+        vote_heat: ``(batch, M)`` heat of every vote's own voxel.
+    """
+
+    center_seed: Tensor
+    heat: Tensor
+    vote_heat: Tensor
+
+
+def heatmap_peaks(
+    votes: Float[Tensor, "batch votes 3"],
+    voxel_size: float,
+    count: int,
+    window: int = 1,
+    center_seed: str = "mean",
+) -> Peaks:
+    """The ``count`` hottest local peaks.
+
+    A voxel is a peak when no occupied voxel within ``window`` voxels (in every axis) has more heat, or as much and
+    holds an earlier vote. ``window`` 1 is the paper's 3x3x3 maximum; a wider one merges the two peaks that the votes
+    of one instance leave when they are scattered over several voxels.
+
+    Args:
+        votes: metres.
+        voxel_size: metres.
+        count: K; when there are fewer peaks the rest has heat 0 and some vote's position.
+        window: half width of the neighbourhood in voxels.
+        center_seed: ``voxel`` for the voxel's centre (the paper's), ``mean`` for the heat-weighted mean of the votes
+            in the 3x3x3 voxels, which does not jump with the grid.
+    """
+    heat, beaten, mean = _heatmap(votes, voxel_size, window)
+    peak_heat, at = torch.topk(heat * (1.0 - beaten), min(count, votes.shape[1]), dim=1)
+    seeds = mean if center_seed == "mean" else (torch.floor(votes / voxel_size) + 0.5) * voxel_size
+    batch = torch.arange(len(votes), device=votes.device)[:, None]
+    return Peaks(seeds[batch, at], peak_heat, heat)
+
+
+def heatmap_reference(
+    votes: Float[Tensor, "batch votes 3"], voxel_size: float, window: int
+) -> tuple[Float[Tensor, "batch votes"], Float[Tensor, "batch votes"], Float[Tensor, "batch votes 3"]]:
+    """Heat of each vote's voxel, 1 where a hotter or earlier vote is near, and the heat-weighted mean of the votes."""
+    voxel = torch.floor(votes / voxel_size)
+    difference = voxel[:, :, None] - voxel[:, None]
+    # exp(-d^2 / 2) at d = 0 and +-1, and 0 beyond: exact on integers.
+    weight = _CENTER * torch.relu(1.0 - (1.0 - _SIDE) * difference.square()).prod(-1)
+    heat = weight.sum(-1)
+    near = difference.abs().amax(-1) <= window
+    index = torch.arange(votes.shape[1], device=votes.device)
+    # Equal voxels have equal heat only up to the order of summation; the tolerance restores the tie.
+    ahead = heat[:, None] - heat[:, :, None]
+    earlier = index[None, :] < index[:, None]
+    beaten = near & ((ahead > _TIE) | ((ahead.abs() <= _TIE) & earlier))
+    return heat, beaten.to(heat.dtype).amax(-1), weight @ votes / heat[..., None]
+
+
+def _heatmap(votes: Tensor, voxel_size: float, window: int) -> tuple[Tensor, Tensor, Tensor]:
+    plain = votes.device.type == "cpu" and votes.dtype == torch.float32 and not torch.compiler.is_compiling()
+    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+    if library is None:
+        return heatmap_reference(votes, voxel_size, window)
+    batch, count, _ = votes.shape
+    heat, beaten, mean = torch.empty(batch, count), torch.empty(batch, count), torch.empty(batch, count, 3)
+    for one, *out in zip(votes.detach().contiguous(), heat, beaten, mean, strict=True):
+        arrays = [t.numpy() for t in out]
+        native.call(library.heatmap, one.numpy(), count, float(voxel_size), window, _CENTER, _SIDE, _TIE, *arrays)
+    return heat, beaten, mean
+
+
+def gather_votes(
+    votes: Float[Tensor, "batch votes 3"],
+    center_seed: Float[Tensor, "batch proposals 3"],
+    radius: float,
+    count: int,
+) -> Tensor:
+    """Indices ``(batch, proposals, count)`` of votes within ``radius`` of each centre seed (Eqs. 2 and 3).
+
+    The first ``count`` in index order, repeated in turn when there are fewer; the nearest vote when there is none.
+    Votes come in farthest-point order of their seeds, so the first ones are spread over the visible surface. The
+    paper draws at random with repetition; this choice is deterministic and needs no other form at export.
+    """
+    squared = (center_seed[:, :, None] - votes[:, None]).square().sum(-1)
+    total = votes.shape[1]
+    order = torch.arange(total, 0, -1, device=votes.device, dtype=votes.dtype)
+    inside = squared <= radius * radius
+    nearest = squared.argmin(-1)
+    rank, index = torch.topk(torch.where(inside, order, -squared), min(count, total), dim=-1)
+    found = (rank > 0).sum(-1, keepdim=True)
+    position = torch.arange(count, device=votes.device) % found.clamp(min=1)
+    index = torch.take_along_dim(index, position, dim=-1)
+    return torch.where(found > 0, index, nearest[..., None])
