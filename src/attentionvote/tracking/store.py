@@ -131,7 +131,8 @@ def connect(uri: str) -> MlflowClient:
     # One sentence of ours says that a server is away; urllib3 and alembic would add a page.
     for name in ("urllib3.connectionpool", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    with _exclusive(uri):
+    with _exclusive(uri), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
         try:
             return MlflowClient(uri, registry_uri=uri)
         except MlflowException as error:
