@@ -51,13 +51,12 @@ def command(verb: str, run: Run, *, defaults: Defaults | None = None, conf: Path
         print(_help(verb, conf))
         sys.exit(0)
     with _one_sentence(verb):
-        if defaults is not None:
-            words = [*defaults([w for w in words if not w.startswith("-")]), *words]
-        overrides = [word for word in words if not word.startswith("-")]
-        if len(overrides) == len(words):
-            _print_result(run, compose(verb, overrides, conf))
+        said = [word for word in words if not word.startswith("-")]
+        machine = defaults(said) if defaults is not None else []
+        if len(said) == len(words):
+            _print_result(run, compose(verb, [*machine, *words], conf))
         else:
-            _with_hydra(verb, run, words, overrides, conf)
+            _with_hydra(verb, run, words, machine, conf)
     sys.exit(0)
 
 
@@ -114,14 +113,15 @@ def _jsonable(value: Any) -> Any:
     return str(value)
 
 
-def _with_hydra(verb: str, run: Run, words: Sequence[str], overrides: Sequence[str], conf: Path) -> None:
+def _with_hydra(verb: str, run: Run, words: Sequence[str], machine: Sequence[str], conf: Path) -> None:
     """Hydra's own flags (``--multirun``, ``--cfg job`` ...): every job of a grid is checked before the first starts."""
     import hydra
     from configuration import parse
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 
     if "-m" in words or "--multirun" in words:
-        grid = [o for o in parse(overrides) if not o.key_or_group.startswith("hydra")]
+        said = [word for word in words if not word.startswith("-")]
+        grid = [o for o in parse([*machine, *said]) if not o.key_or_group.startswith("hydra")]
         for job in BasicSweeper.split_arguments(grid, None)[0]:
             compose(verb, job, conf)
 
@@ -140,7 +140,7 @@ def _with_hydra(verb: str, run: Run, words: Sequence[str], overrides: Sequence[s
     given = {word.partition("=")[0] for word in words}
     # argparse takes the overrides from one place only: ours go in front of the user's first.
     place = next((i for i, word in enumerate(words) if "=" in word), len(words))
-    own = [f"{key}={value}" for key, value in own_defaults.items() if key not in given]
+    own = [*(f"{key}={value}" for key, value in own_defaults.items() if key not in given), *machine]
     sys.argv = [sys.argv[0], *words[:place], *own, *words[place:]]
     hydra.main(config_path=str(conf), config_name=verb, version_base="1.3")(task)()
 
@@ -214,5 +214,7 @@ def _help(verb: str, conf: Path) -> str:
     except ConfigurationError:  # e.g. a mandatory setting: show what the file itself holds
         settings = leaves({key: value for key, value in primary.items() if key != "defaults"})
     lines += ["", "Settings (key=value) and their defaults:"]
-    lines += [f"  {key}={json.dumps(value)}" for key, value in settings if not key.startswith("hydra.")]
+    lines += [
+        f"  {key}={json.dumps(value, ensure_ascii=False)}" for key, value in settings if not key.startswith("hydra.")
+    ]
     return "\n".join([*lines, "", "A comma-separated list of values with -m runs a grid (Hydra's multirun)."])

@@ -97,18 +97,17 @@ def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfi
     chosen = [o for o in parsed if o.input_line and (conf / o.key_or_group).is_dir()]
     for override in chosen:
         _check_choice(override, conf)
-    hydra_own = [o.input_line for o in parsed if o.input_line and o.key_or_group.split("/")[0].split(".")[0] == "hydra"]
-    base = _plain(_compose(verb, [*(str(o.input_line) for o in chosen), *(str(w) for w in hydra_own)], conf))
-    values = [o for o in parsed if o not in chosen and o.input_line not in hydra_own]
-    for override in values:
-        _check_key(override, base, conf)
+    values = [o for o in parsed if o not in chosen and o.key_or_group.split("/")[0].split(".")[0] != "hydra"]
+    if values:
+        base = _plain(_compose(verb, [str(o.input_line) for o in parsed if o not in values], conf))
+        for override in values:
+            _check_key(override, base, conf)
     cfg = _compose(verb, overrides, conf)
     final = _plain(cfg)
     for override in values:
+        key = override.key_or_group
         if not (override.is_add() or override.is_delete()):
-            _check_types(
-                override.key_or_group, _select(base, override.key_or_group), _select(final, override.key_or_group)
-            )
+            _check_types(key, _select(base, key), _select(final, key))
     for key, value in leaves(final):
         problem = violation(key, value)
         if problem:
@@ -205,6 +204,8 @@ def _check_types(key: str, default: Any, value: Any) -> None:
     if isinstance(default, list):
         if not isinstance(value, list):
             raise ConfigurationError(f"{key} must be a list such as {default}; got {value!r}")
+        if default and not value:
+            raise ConfigurationError(f"{key} must not be empty, a list such as {default}; got []")
         for index, item in enumerate(value if default else ()):
             _check_types(f"{key}[{index}]", default[min(index, len(default) - 1)], item)
         return

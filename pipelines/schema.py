@@ -9,19 +9,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
 
 @dataclass(frozen=True)
 class Range:
-    """What a number may be, or a text. ``low``/``high`` are inclusive; ``above`` is exclusive."""
+    """What the values of the settings that match ``pattern`` may be.
+
+    Args:
+        pattern: of dotted keys, shell style.
+        low, high: inclusive bounds of a number.
+        above: exclusive bound of a number.
+        options: the texts that are allowed.
+        kind: ``int``, ``float`` or ``str``, for settings whose default is null and so carries no type.
+    """
 
     pattern: str
     low: float = -math.inf
     high: float = math.inf
     above: float = -math.inf
     options: tuple[str, ...] = ()
+    kind: type | None = None
 
     def __str__(self) -> str:
         if self.options:
@@ -33,23 +43,50 @@ class Range:
             parts.append(f"at least {self.low:g}")
         if self.high < math.inf:
             parts.append(f"at most {self.high:g}")
-        return " and ".join(parts) or "a finite number"
+        noun = {int: "a whole number ", float: "a number ", str: "a text ", None: ""}[self.kind]
+        return noun + " and ".join(parts) if parts else noun.strip() or "a finite number"
 
     def accepts(self, value: object) -> bool:
-        """Whether ``value`` lies in the range; what is no number (or no text with options) is not judged."""
-        if self.options:
-            return not isinstance(value, str) or value in self.options
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        """Whether ``value`` may stand here; null always may, texts are judged by options, numbers by bounds."""
+        if value is None or isinstance(value, bool):
+            return value is None or self.kind is None
+        if isinstance(value, str):
+            return self.kind in (None, str) and (not self.options or value in self.options)
+        if not isinstance(value, (int, float)):
             return True
+        if self.options or self.kind is str or (self.kind is int and isinstance(value, float)):
+            return False
         return math.isfinite(value) and self.low <= value <= self.high and value > self.above
 
 
 RANGES: tuple[Range, ...] = (
     Range("seed", low=0, high=2**32 - 1),
     Range("*.seed", low=0, high=2**32 - 1),
-    Range("object.diameter", above=0, high=10),
+    Range("object.diameter", above=0, high=10, kind=float),
+    Range("object.base_radius", above=0, high=10, kind=float),
+    Range("object.voxel_size", above=0, high=10, kind=float),
     Range("object.units", options=("m", "cm", "mm", "inch")),
-    Range("*workers", low=1, high=1024),
+    Range("*splits", options=("train", "val", "test")),
+    Range("*split", options=("train", "val", "test")),
+    Range("*sensor", options=("none", "gaussian", "phoxi")),
+    Range("simulation.cycles.*", low=1),
+    Range("simulation.drop_counts", low=1, high=1000),
+    Range("simulation.bin.size", above=0, high=100, kind=float),
+    Range("simulation.*jitter", low=0, high=0.9),
+    Range("simulation.camera.distance", above=0, high=100, kind=float),
+    Range("simulation.camera.camera.[wh]*", low=8, high=16384),
+    Range("simulation.camera.camera.f[xy]", above=0),
+    Range("simulation.camera.*_degrees", low=0, high=180),
+    Range("simulation.camera.shift", low=0, high=1),
+    Range("simulation.drop.timestep", above=0, high=0.05),
+    Range("simulation.drop.contact_time", above=0, high=0.5),
+    Range("simulation.drop.hull_threshold", above=0, high=1),
+    Range("simulation.drop.hull_vertices", low=4, high=4096),
+    Range("simulation.drop.speed", above=0, high=100),
+    Range("simulation.drop.timeout", above=0),
+    Range("simulation.visibility_stride", low=1, high=64),
+    Range("*max_points", low=3),
+    Range("*workers", low=1, high=1024, kind=int),
     Range("*batch_size", low=1),
     Range("*.lr", above=0, high=10),
     Range("*learning_rate", above=0, high=10),
@@ -57,13 +94,12 @@ RANGES: tuple[Range, ...] = (
     Range("*dropout", low=0, high=1),
     Range("*probability", low=0, high=1),
     Range("*_fraction", low=0, high=1),
-    Range("*restitution", low=0, high=1),
     # Everything else that is a number is a count, a length, a weight or a rate: never negative.
     Range("*", low=0),
 )
 
 # Settings that may be negative: coordinates, angles and offsets.
-SIGNED: tuple[str, ...] = ("object.symmetry.*", "*axis*", "*gravity*", "*offset*")
+SIGNED: tuple[str, ...] = ("object.symmetry.*", "*axis*", "*offset*")
 
 
 def range_of(key: str) -> Range:
@@ -78,5 +114,6 @@ def violation(key: str, value: Any) -> str:
     allowed = range_of(key)
     for item in value if isinstance(value, list) else [value]:
         if not allowed.accepts(item):
-            return f"{key} must be {allowed}; got {item!r}"
+            close = get_close_matches(str(item), allowed.options, n=1)
+            return f"{key} must be {allowed}; got {item!r}" + (f", did you mean {close[0]!r}?" if close else "")
     return ""

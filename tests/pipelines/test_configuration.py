@@ -1,0 +1,124 @@
+"""Composition and its sentences, on a small configuration folder of the test's own."""
+# ruff: noqa: E501 (a table of words and sentences)
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from configuration import ConfigurationError, compose, leaves, nearest, sentence, type_problem
+
+FILES = {
+    "fake.yaml": """
+defaults: [_self_, {object: "???"}, {trainer: default}, {experiment: null}]
+seed: 0
+batch_size: 4
+workers: null
+flag: true
+lengths: [1.0, 2.0]
+title: a text
+out: ${trainer.dir}/x
+must: given
+""",
+    "object/connecting_rod.yaml": "{name: connecting_rod, diameter: 0.143}",
+    "object/gear.yaml": "{name: gear, diameter: 0.121}",
+    "trainer/default.yaml": "{lr: 0.001, max_epochs: 3, dir: outputs}",
+    "trainer/broken.yaml": "{lr: [0.001",
+    "experiment/short.yaml": "# @package _global_\ntrainer: {max_epochs: 1}\n",
+    "experiment/negative.yaml": "# @package _global_\nbatch_size: -4\n",
+    "experiment/misspelt.yaml": "# @package _global_\ndefaults: [{override /trainer: defualt}]\n",
+}
+
+
+@pytest.fixture(scope="module")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like conf/."""
+    root = tmp_path_factory.mktemp("conf")
+    for name, text in FILES.items():
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_text(text, encoding="utf-8")
+    return root
+
+
+def test_compose_takes_overrides_and_resolves_everything(conf: Path) -> None:
+    cfg = compose("fake", ["object=gear", "trainer.lr=0.1", "trainer.dir=a b", "workers=3"], conf)
+    assert (cfg.object.name, cfg.trainer.lr, cfg.out, cfg.workers) == ("gear", 0.1, "a b/x", 3)
+
+
+def test_an_experiment_is_stronger_than_the_primary_file_and_weaker_than_the_words(conf: Path) -> None:
+    assert compose("fake", ["object=gear", "experiment=short"], conf).trainer.max_epochs == 1
+    assert compose("fake", ["object=gear", "experiment=short", "trainer.max_epochs=9"], conf).trainer.max_epochs == 9
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("", "object must be given, one of connecting_rod, gear"),
+        ("object=conecting_rod", "object must be one of connecting_rod, gear; got 'conecting_rod', did you mean 'connecting_rod'?"),
+        ("object=null", "object must be one of connecting_rod, gear; got 'null'"),
+        ("object=gear,connecting_rod", "object=gear,connecting_rod lists several choices, which needs -m (a grid of runs)"),
+        ("object=gear objct=gear", "there is no setting 'objct', did you mean 'object'?"),
+        ("object=gear trainer.max_epoch=3", "there is no setting 'trainer.max_epoch', did you mean 'trainer.max_epochs'?"),
+        ("object=gear lr=abc", "there is no setting 'lr', did you mean 'trainer.lr'?"),
+        ("object=gear max_epoch=1", "there is no setting 'max_epoch', did you mean 'trainer.max_epochs'?"),
+        ("object=gear nothing_like_it=1", "there is no setting 'nothing_like_it'"),
+        ("object=gear trainer.lr=abc", "trainer.lr must be a finite number such as 0.001; got 'abc'"),
+        ("object=gear trainer.lr=null", "trainer.lr must be a finite number such as 0.001; got null"),
+        ("object=gear trainer.lr=true", "trainer.lr must be a finite number such as 0.001; got True"),
+        ("object=gear trainer.lr=[1]", "trainer.lr must be a finite number such as 0.001; got [1]"),
+        ("object=gear trainer.lr=-1", "trainer.lr must be greater than 0 and at most 10; got -1"),
+        ("object=gear batch_size=2.5", "batch_size must be a whole number such as 4; got 2.5"),
+        ("object=gear batch_size=-2", "batch_size must be at least 1; got -2"),
+        ("object=gear workers=0", "workers must be a whole number at least 1 and at most 1024; got 0"),
+        ("object=gear flag=3", "flag must be true or false, such as True; got 3"),
+        ("object=gear lengths=[1,a]", "lengths[1] must be a finite number such as 2.0; got 'a'"),
+        ("object=gear lengths=[]", "lengths must not be empty, a list such as [1.0, 2.0]; got []"),
+        ("object=gear lengths=3", "lengths must be a list such as [1.0, 2.0]; got 3"),
+        ("object=gear title=[x]", "title must be a text such as a text; got ['x']"),
+        ("object=gear must=???", "must must be given, e.g. must=VALUE"),
+        ("object=gear trainer.dir=${nowhere}", "out cannot be resolved: Interpolation key 'nowhere' not found"),
+        ("object=gear foo", "every argument must be key=value, got 'foo'"),
+        ("object=gear seed={", "every argument must be key=value, got 'seed={'"),
+        ("object=gear experiment=negative", "batch_size must be at least 1; got -4"),
+        ("object=gear experiment=misspelt", "trainer must be one of broken, default; got 'defualt', did you mean 'default'?"),
+    ],
+)  # fmt: skip
+def test_what_is_impossible_gets_one_sentence(conf: Path, words: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as raised:
+        compose("fake", words.split(), conf)
+    assert sentence(raised.value) == expected
+
+
+def test_a_broken_file_is_named(conf: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"broken\.yaml"):
+        compose("fake", ["object=gear", "trainer=broken"], conf)
+
+
+@pytest.mark.parametrize(("words", "value"), [("+new=1", 1), ("++seed=3", 3)])
+def test_plus_adds_what_is_not_there(conf: Path, words: str, value: int) -> None:
+    cfg = compose("fake", ["object=gear", words], conf)
+    assert cfg[words.strip("+").partition("=")[0]] == value
+
+
+@pytest.mark.parametrize(
+    ("default", "value", "fits"),
+    [(1, 2, True), (1, 2.0, False), (1, True, False), (1.0, 2, True), (1.0, "2", False), (1.0, float("nan"), False),
+     (True, False, True), (True, 1, False), ("a", "b", True), ("a", 3, True), ("a", None, False), (1, None, False)],
+)  # fmt: skip
+def test_a_value_must_have_the_type_of_the_default_it_replaces(default: object, value: object, fits: bool) -> None:
+    assert (type_problem(default, value) == "") is fits
+
+
+def test_nearest_prefers_the_same_last_name() -> None:
+    assert nearest("lr", ["lb", "trainer.lr"]) == ", did you mean 'trainer.lr'?"
+    assert nearest("zebra", ["trainer.lr"]) == ""
+
+
+def test_leaves_are_dotted_keys() -> None:
+    assert dict(leaves({"a": {"b": 1, "c": {}}, "d": [1]})) == {"a.b": 1, "a.c": {}, "d": [1]}
+
+
+def test_a_sentence_is_one_line_and_never_empty() -> None:
+    assert sentence(ValueError("a\n   b")) == "a b"
+    assert sentence(KeyError()) == "KeyError"
+    assert sentence(FileNotFoundError(2, "No such file", "x.stl")) == "file not found: x.stl"
