@@ -43,7 +43,9 @@ class Range:
             parts.append(f"at least {self.low:g}")
         if self.high < math.inf:
             parts.append(f"at most {self.high:g}")
-        noun = {int: "a whole number ", float: "a number ", str: "a text ", None: ""}[self.kind]
+        noun = {"int": "a whole number ", "float": "a number ", "str": "a text "}.get(
+            getattr(self.kind, "__name__", ""), ""
+        )
         return noun + " and ".join(parts) if parts else noun.strip() or "a finite number"
 
     def accepts(self, value: object) -> bool:
