@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from attentionvote.geometry.pose import inverse, rotation_about, transform
 
-# A PhoXi M above a bin of 143 mm parts; the distance scales with D, so every part fills the same picture.
+# A PhoXi M above a bin of 143 mm parts; the distance scales with the bin, so every bin fills the picture.
 REFERENCE_DISTANCE = 0.80
 REFERENCE_DIAMETER = 0.143
 
@@ -46,7 +46,7 @@ class CameraSettings:
 
     Args:
         camera: intrinsics.
-        distance: metres to the bin's middle; None scales 0.80 m with D / 143 mm.
+        distance: metres to the bin's middle; None scales 0.80 m with the bin.
         distance_jitter: relative, uniform in ``1 - jitter .. 1 + jitter``.
         shift: sideways jitter per axis, as a share of the distance.
         tilt_degrees: the camera swings around the bin by up to so much, in a random direction.
@@ -73,7 +73,13 @@ class CameraSettings:
                 raise ValueError(f"camera {name} must lie in {low}..{high}, got {getattr(self, name)}")
 
     def sample(self, diameter: float, bin_height: float, rng: np.random.Generator) -> NDArray[np.float64]:
-        """``camera_from_bin`` ``(4, 4)``: the camera looks down at a point a third up the bin's axis, with jitter."""
+        """``camera_from_bin`` ``(4, 4)``: the camera looks down at a point a third up the bin's axis, with jitter.
+
+        Args:
+            diameter: what the distance scales with, ``BinSettings.scaling_diameter``, metres.
+            bin_height: metres.
+            rng: decides the jitter.
+        """
         distance = self.distance or REFERENCE_DISTANCE * diameter / REFERENCE_DIAMETER
         distance *= rng.uniform(1 - self.distance_jitter, 1 + self.distance_jitter)
         shift = rng.uniform(-1, 1, size=2) * self.shift * distance

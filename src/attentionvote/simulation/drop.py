@@ -13,14 +13,17 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part
 from attentionvote.simulation.decomposition import Hulls
 
-# The bin of the IPA-like protocol, for a part of 143 mm; it scales with D.
+# The bin of the IPA-like protocol, for slender parts of 143 mm.
 REFERENCE_DIAMETER = 0.143
 REFERENCE_BIN = (0.360, 0.280, 0.160)
+# Heaps of bulky parts reach the rim when the parts' convex hulls take about half of the bin's volume.
+_LARGEST_FILL = 0.45
 _DENSITY = 2700.0  # kg/m^3; piles do not depend on it, contacts are normalised by mass
 _SMALL_DIAMETER = 0.040  # below it, time step and contact time constant are halved
 
@@ -30,7 +33,8 @@ class BinSettings:
     """The bin.
 
     Args:
-        size: inner length, width and height in metres; None scales 360 x 280 x 160 mm with D / 143 mm.
+        size: inner length, width and height in metres; None scales 360 x 280 x 160 mm, see
+            :meth:`scaling_diameter`.
         jitter: every side is multiplied by a factor uniform in ``1 - jitter .. 1 + jitter``, once per cycle.
     """
 
@@ -45,8 +49,19 @@ class BinSettings:
         if not 0 <= self.jitter <= 0.5:
             raise ValueError(f"bin jitter must lie in 0..0.5, got {self.jitter}")
 
+    def scaling_diameter(self, part: Part, count: int) -> float:
+        """The diameter in metres, relative to 143 mm, that bin and camera distance scale with.
+
+        It is D, or more for bulky parts, of which ``count`` would not fit into a bin scaled with D; with a given bin
+        size, the diameter that belongs to its length.
+        """
+        if self.size is not None:
+            return self.size[0] / REFERENCE_BIN[0] * REFERENCE_DIAMETER
+        fill = count * ConvexHull(part.vertices).volume / np.prod(REFERENCE_BIN)
+        return max(part.diameter, float(REFERENCE_DIAMETER * (fill / _LARGEST_FILL) ** (1 / 3)))
+
     def sample(self, diameter: float, rng: np.random.Generator) -> NDArray[np.float64]:
-        """``(3,)`` inner size in metres for one cycle."""
+        """``(3,)`` inner size in metres for one cycle, ``diameter`` from :meth:`scaling_diameter`."""
         size = np.array(self.size or np.array(REFERENCE_BIN) * diameter / REFERENCE_DIAMETER)
         return size * rng.uniform(1 - self.jitter, 1 + self.jitter, size=3)
 

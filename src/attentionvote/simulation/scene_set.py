@@ -85,7 +85,8 @@ def simulate_cycle(part: Part, hulls: Hulls, caster: PartCaster, spec: SceneSetS
     """The scenes of one drop cycle; a pure function of its arguments."""
     physics_seed, *scene_seeds = spec.cycle_seed(cycle).spawn(1 + len(spec.drop_counts))
     rng = np.random.default_rng(physics_seed)
-    bin_size = spec.bin.sample(part.diameter, rng)
+    scale = spec.bin.scaling_diameter(part, spec.drop_counts[-1])
+    bin_size = spec.bin.sample(scale, rng)
     friction = float(rng.uniform(*spec.drop.friction))
     seeds = dict(zip(spec.drop_counts, scene_seeds, strict=True))
     records = []
@@ -94,7 +95,7 @@ def simulate_cycle(part: Part, hulls: Hulls, caster: PartCaster, spec: SceneSetS
         if count not in seeds:
             continue
         scene_rng = np.random.default_rng(seeds[count])
-        camera_from_bin = spec.camera.sample(part.diameter, float(bin_size[2]), scene_rng)
+        camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
         camera_from_part = camera_from_bin @ pile.bin_from_part
         surface = BinSurface(bin_size, camera_from_bin)
         records.append(
