@@ -59,7 +59,7 @@ def heap() -> Callable[..., NDArray]:
 
     def make(count: int, seed: int = 0, spread: float = 0.04) -> NDArray:
         rng = np.random.default_rng(seed)
-        place = rng.uniform(-spread, spread, size=(count, 3)) + (0, 0, 0.4)
+        place = np.array([0, 0, 0.4]) + rng.uniform(-spread, spread, size=(count, 3))
         return transform(matrix_from_quaternion(random_quaternion(rng, (count,))), place)
 
     return make

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,5 +102,7 @@ def load_records(path: Path) -> list[SceneRecord]:
             )
             for i in range(len(f["cycle"]))
         ]
-    except (KeyError, IndexError, EOFError, OSError, ValueError) as error:
-        raise ValueError(f"{path} must be a shard of a scene set, but it cannot be read: {error}") from error
+    except (KeyError, IndexError, EOFError, OSError, ValueError, BadZipFile) as error:
+        raise ValueError(
+            f"{path} must be a shard of a scene set, but it cannot be read: delete it and generate again"
+        ) from error

@@ -59,7 +59,7 @@ class Sensor:
         if self.preset not in PRESETS:
             near = difflib.get_close_matches(str(self.preset), PRESETS, n=1, cutoff=0.0)[0]
             raise ValueError(
-                f"sensor preset must be one of {', '.join(PRESETS)}, got {self.preset!r}: nearest is {near}"
+                f"sensor preset must be one of {', '.join(PRESETS)}, got {self.preset!r}, did you mean {near!r}?"
             )
         object.__setattr__(self, "grazing_degrees", tuple(float(g) for g in self.grazing_degrees))
         for name in ("sigma_mm", "axial_sigma_mm", "baseline"):

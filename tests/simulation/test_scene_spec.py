@@ -1,0 +1,98 @@
+"""Specifications: what changes the digest, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from attentionvote.part import Part
+from attentionvote.simulation.camera import Camera, CameraSettings
+from attentionvote.simulation.drop import BinSettings, DropSettings
+from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
+
+SPEC = SceneSetSpec("0" * 64, "train", 10)
+OTHERS = {
+    "part_digest": "1" * 64,
+    "split": "val",
+    "cycles": 11,
+    "seed": 1,
+    "drop_counts": (6, 10),
+    "bin": BinSettings(jitter=0.1),
+    "camera": CameraSettings(tilt_degrees=5),
+    "drop": DropSettings(timestep=0.005),
+    "visibility_stride": 3,
+    "format_version": 2,
+}
+
+
+def test_every_field_changes_the_digest() -> None:
+    assert set(OTHERS) == set(SceneSetSpec.__dataclass_fields__)
+    digests = {replace(SPEC, **{name: value}).digest() for name, value in OTHERS.items()}
+    assert len(digests | {SPEC.digest()}) == len(OTHERS) + 1
+    assert replace(SPEC, camera=CameraSettings(Camera(fx=1701.0))).digest() != SPEC.digest()
+
+
+def test_the_digest_does_not_depend_on_how_the_values_were_written() -> None:
+    listed = replace(SPEC, drop_counts=[6, 10, 14, 18, 22, 26, 30], drop=DropSettings(friction=[0.2, 0.6]))  # type: ignore[arg-type]
+    assert listed.digest() == SPEC.digest()
+    assert json.loads(json.dumps(SPEC.as_dict())) == SPEC.as_dict()
+
+
+def test_cycles_of_all_splits_have_their_own_seeds() -> None:
+    words = {
+        tuple(replace(SPEC, split=split, seed=seed).cycle_seed(cycle).generate_state(4))
+        for split in ("train", "val", "test")
+        for seed in (0, 1)
+        for cycle in range(50)
+    }
+    assert len(words) == 300
+    # More cycles are the same cycles and some more.
+    longer = replace(SPEC, cycles=99)
+    assert list(longer.cycle_seed(3).generate_state(4)) == list(SPEC.cycle_seed(3).generate_state(4))
+
+
+def test_the_directory_names_part_split_and_digest() -> None:
+    assert scene_set_directory(Path("d"), "gear", SPEC) == Path("d/gear") / f"train-{SPEC.digest()[:12]}"
+
+
+def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None:
+    settings = {
+        "seed": 3,
+        "cycles": {"train": 5, "test": 2},
+        "drop_counts": [2, 4],
+        "bin": {"size": None, "jitter": 0.1},
+        "camera": {"camera": {"width": 640, "height": 480}, "distance": 0.5},
+        "drop": {"friction": [0.3, 0.3]},
+        "visibility_stride": 4,
+    }
+    specs = scene_set_specs(bracket, settings)
+    assert specs["test"] == SceneSetSpec(
+        bracket.digest, "test", 2, 3, (2, 4), BinSettings(None, 0.1), CameraSettings(Camera(640, 480), 0.5),
+        DropSettings(friction=(0.3, 0.3)), 4,
+    )  # fmt: skip
+    assert (specs["train"].cycles, set(specs)) == (5, {"train", "test"})
+    assert settings["seed"] == 3
+    assert settings["camera"]["camera"] == {"width": 640, "height": 480}  # type: ignore[index]
+    with pytest.raises(ValueError, match=r"simulation settings must have the keys of conf/simulation/default.yaml"):
+        scene_set_specs(bracket, settings | {"frcition": 1})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"split": "a/b"}, "split must be a word of letters, digits, - and _, got 'a/b'"),
+        ({"split": ""}, "split must be a word"),
+        ({"cycles": 0}, "cycles must be at least 1, got 0"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
+        ({"drop_counts": ()}, "drop_counts must be increasing numbers within 1..200, got []"),
+        ({"drop_counts": (5, 5)}, "drop_counts must be increasing numbers within 1..200, got"),
+        ({"drop_counts": (0, 5)}, "drop_counts must be increasing numbers within 1..200, got"),
+        ({"visibility_stride": 9}, "visibility_stride must lie in 1..8, got 9"),
+    ],
+)
+def test_impossible_specifications(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message.replace("[]", r"\[\]")):
+        replace(SPEC, **change)
