@@ -2,10 +2,11 @@
 
 import logging
 import shutil
+from pathlib import Path
 
 import pytest
 
-from attentionvote.tracking.artifact_writer import ArtifactWriter, check_artifact_name
+from attentionvote.tracking.artifact_writer import ArtifactWriter, check_artifact_name, local_folder
 
 
 class NoClient:
@@ -76,3 +77,16 @@ def test_close_names_what_is_lost(writer, folder):
 def test_names_stay_inside_the_run(name):
     with pytest.raises(ValueError, match="must be a relative path inside the run"):
         check_artifact_name(name)
+
+
+@pytest.mark.parametrize(
+    ("uri", "folder"),
+    [
+        ("file:///a%20b/run/artifacts", "/a b/run/artifacts"),
+        ("/a b/run/artifacts", "/a b/run/artifacts"),
+        ("mlflow-artifacts:/1/run/artifacts", None),
+        ("s3://bucket/1/run/artifacts", None),
+    ],
+)
+def test_local_folder_is_none_for_what_a_server_keeps(uri, folder):
+    assert local_folder(uri) == (folder and Path(folder))

@@ -24,9 +24,10 @@ RETRY_S = 30.0
 
 def local_folder(artifact_uri: str) -> Path | None:
     """Folder of a run's artefacts when they lie on this machine, None when a server keeps them."""
-    if artifact_uri.startswith("file:"):
-        return Path(urllib.request.url2pathname(urllib.parse.urlsplit(artifact_uri).path))
-    return Path(artifact_uri) if "://" not in artifact_uri else None
+    parts = urllib.parse.urlsplit(artifact_uri)
+    if parts.scheme not in ("", "file"):  # a server's artefacts are "mlflow-artifacts:/...", a bucket's "s3://..."
+        return None
+    return Path(urllib.request.url2pathname(parts.path)) if parts.scheme else Path(artifact_uri)
 
 
 def check_artifact_name(name: str) -> str:
