@@ -82,7 +82,7 @@ def load_records(path: Path) -> list[SceneRecord]:
         ValueError: when the file is not one of them.
     """
     try:
-        with np.load(path) as stored:
+        with path.open("rb") as file, np.load(file) as stored:
             f = {name: stored[name] for name in stored.files}
         borders = np.cumsum(f["drop_count"])[:-1]
         poses = np.split(_unpack(f["camera_from_part"]), borders)

@@ -1,0 +1,85 @@
+"""The verb generate, in this process: what it writes, returns and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import generate
+import numpy as np
+import pytest
+from configuration import ConfigurationError, compose
+from scipy.spatial import ConvexHull
+
+from attentionvote.part import Part
+from attentionvote.simulation import scene_set
+from attentionvote.simulation.scene_set import SceneSet
+
+TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]", "workers=1"]
+
+
+def one_hull(part: Part, *_: object) -> tuple:
+    return (part.vertices[ConvexHull(part.vertices).vertices],)
+
+
+@pytest.fixture(autouse=True)
+def quick_hulls(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
+
+
+def run(root: Path, *overrides: str) -> dict:
+    return generate.run(compose("generate", [*TINY, f"root={root}", *overrides]))
+
+
+def test_every_split_is_generated_once(tmp_path: Path) -> None:
+    result = json.loads(json.dumps(run(tmp_path)))
+    assert (result["stage"], result["object"], sorted(result["sets"])) == (
+        "generate",
+        "brick",
+        ["test", "train", "val"],
+    )
+    for split, entry in result["sets"].items():
+        assert Path(entry["directory"]) == tmp_path / "brick" / f"{split}-{entry['spec_digest'][:12]}"
+        scenes = SceneSet.open(Path(entry["directory"]))
+        assert (len(scenes), scenes.digest) == (entry["scenes"], entry["digest"])
+    assert result["sets"]["train"]["scenes"] == 4
+    shard = Path(result["sets"]["train"]["directory"]) / "cycles" / "00000.npz"
+    written = shard.stat().st_mtime_ns
+    again = run(tmp_path)
+    assert again["sets"] == result["sets"]
+    assert shard.stat().st_mtime_ns == written
+    assert run(tmp_path, "force=true", "splits=[train]")["sets"]["train"] == result["sets"]["train"]
+    assert shard.stat().st_mtime_ns > written
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("splits=[trian]", r"splits must be among train, val, test; got \['trian'\]"),
+        ("splits=[]", "splits must be among train, val, test; got"),
+        ("simulation.bin.jitter=0.9", "bin jitter must lie in 0..0.5, got 0.9"),
+        ("simulation.drop_counts=[3,2]", "drop_counts must be increasing numbers"),
+        ("object.mesh=builtin:brik", "object brick: .*brick"),
+    ],
+)
+def test_impossible_requests_write_nothing(tmp_path: Path, override: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        run(tmp_path / "scenes", override)
+    assert not (tmp_path / "scenes").exists()
+
+
+@pytest.mark.parametrize("simulation", ["default", "fast", "smoke"])
+def test_the_presets_are_valid_and_spell_out_the_defaults(simulation: str) -> None:
+    from omegaconf import OmegaConf
+
+    from attentionvote.simulation import scene_set_specs
+    from attentionvote.simulation.scene_spec import SceneSetSpec
+
+    cfg = compose("generate", ["object=brick", f"simulation={simulation}"])
+    part = Part("box", np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]), 1.0)
+    specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation))  # type: ignore[arg-type]
+    assert set(specs) == {"train", "val", "test"}
+    if simulation == "default":
+        assert specs["train"] == SceneSetSpec(part.digest, "train", cfg.simulation.cycles.train)
+    else:
+        assert (specs["train"].drop.timestep, specs["train"].drop.contact_time) == (0.008, 0.02)
