@@ -33,11 +33,8 @@ def run(root: Path, *overrides: str) -> dict:
 
 def test_every_split_is_generated_once(tmp_path: Path) -> None:
     result = json.loads(json.dumps(run(tmp_path)))
-    assert (result["stage"], result["object"], sorted(result["sets"])) == (
-        "generate",
-        "brick",
-        ["test", "train", "val"],
-    )
+    assert (result["stage"], result["object"]) == ("generate", "brick")
+    assert sorted(result["sets"]) == ["test", "train", "val"]
     for split, entry in result["sets"].items():
         assert Path(entry["directory"]) == tmp_path / "brick" / f"{split}-{entry['spec_digest'][:12]}"
         scenes = SceneSet.open(Path(entry["directory"]))
@@ -55,8 +52,8 @@ def test_every_split_is_generated_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("splits=[trian]", r"splits must be among train, val, test; got \['trian'\]"),
-        ("splits=[]", "splits must be among train, val, test; got"),
+        ("splits=[trian]", "splits must be .*train, val, test; got .*'trian'"),
+        ("splits=[]", "splits must .*train.*val.*test"),
         ("simulation.bin.jitter=0.9", "bin jitter must lie in 0..0.5, got 0.9"),
         ("simulation.drop_counts=[3,2]", "drop_counts must be increasing numbers"),
         ("object.mesh=builtin:brik", "object brick: .*brick"),
