@@ -8,6 +8,7 @@ command line. ``None`` (null) always passes: whether a setting may be null is it
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
@@ -23,7 +24,7 @@ class Range:
         low, high: inclusive bounds of a number.
         above: exclusive bound of a number.
         options: the texts that are allowed.
-        kind: ``int``, ``float`` or ``str``, for settings whose default is null and so carries no type.
+        kind: ``int``, ``float``, ``str`` or ``dict``, for settings whose default is null and so carries no type.
     """
 
     pattern: str
@@ -31,7 +32,7 @@ class Range:
     high: float = math.inf
     above: float = -math.inf
     options: tuple[str, ...] = ()
-    kind: type | None = None
+    kind: type[int] | type[float] | type[str] | type[dict] | None = None
 
     def __str__(self) -> str:
         if self.options:
@@ -43,8 +44,8 @@ class Range:
             parts.append(f"at least {self.low:g}")
         if self.high < math.inf:
             parts.append(f"at most {self.high:g}")
-        noun = {"int": "a whole number ", "float": "a number ", "str": "a text "}.get(
-            getattr(self.kind, "__name__", ""), ""
+        noun = {int: "a whole number ", float: "a number ", str: "a text ", dict: "a section or null "}.get(
+            self.kind, ""
         )
         return noun + " and ".join(parts) if parts else noun.strip() or "a finite number"
 
@@ -52,6 +53,8 @@ class Range:
         """Whether ``value`` may stand here; null always may, texts are judged by options, numbers by bounds."""
         if value is None or isinstance(value, bool):
             return value is None or self.kind is None
+        if self.kind is dict:
+            return isinstance(value, dict)
         if isinstance(value, str):
             return self.kind in (None, str) and (not self.options or value in self.options)
         if not isinstance(value, (int, float)):
@@ -88,14 +91,47 @@ RANGES: tuple[Range, ...] = (
     Range("simulation.drop.timeout", above=0),
     Range("simulation.visibility_stride", low=1, high=64),
     Range("*max_points", low=3),
+    Range("data.workers", low=0, high=1024),  # 0 = in the training process
+    Range("data.sensor.preset", options=("none", "gaussian", "phoxi")),
+    Range("data.density", low=3),
+    Range("data.pool", low=3),
+    Range("data.points", low=3),
+    Range("data.normal_neighbors", low=3, high=1000),
+    Range("data.augmentation.tilt", low=0, high=3.15),
+    Range("data.workers", low=0, high=1024),  # 0: samples are drawn in the training process
     Range("*workers", low=1, high=1024, kind=int),
+    Range("model.centers", low=1),
+    Range("model.neighbors", low=1),
+    Range("model*widths", low=1),
+    Range("model.base_radius", above=0, high=10, kind=float),
+    Range("model.voxel_size", above=0, high=10, kind=float),
+    Range("model.voting_radius", above=0, high=10, kind=float),
+    Range("model.*_fraction", above=0, high=10),
+    Range("model.center_seed", options=("voxel", "mean")),
+    Range("model.rotation", options=("quaternion", "six")),
+    Range("*.confidence", options=("exponential", "quality")),
+    Range("model.refinement", kind=dict),
+    Range("model.refinement_steps", low=0, high=100),
+    Range("model.*", low=1),
+    Range("loss.settings.rotation", options=("metric", "slerp", "minra", "nlerp")),
+    Range("loss.settings.least_visible", low=0, high=1),
+    Range("trainer.optimizer", options=("adam", "adamw")),
+    Range("trainer.learning_rate", above=0, high=10),
+    Range("trainer.schedule.shape", options=("step", "cosine", "constant")),
+    Range("trainer.schedule.milestones", low=1),
+    Range("trainer.schedule.decay", above=0, high=1),
+    Range("trainer.schedule.vote_radius_factor", above=0, high=100),
+    Range("trainer.average_decay", low=0, high=0.999999),
+    Range("trainer.precision", options=("auto", "32-true", "bf16-mixed", "16-mixed", "64-true")),
+    Range("trainer.accelerator", options=("auto", "cpu", "gpu", "cuda", "mps")),
+    Range("trainer.threads", low=1, high=1024, kind=int),
+    Range("trainer.validate_every", low=1),
+    Range("trainer.log_every_steps", low=1),
+    Range("tracking.store", kind=str),
+    Range("resume", options=("auto", "never")),
     Range("*batch_size", low=1),
     Range("*.lr", above=0, high=10),
-    Range("*learning_rate", above=0, high=10),
     Range("*epochs", low=1),
-    Range("*dropout", low=0, high=1),
-    Range("*probability", low=0, high=1),
-    Range("*_fraction", low=0, high=1),
     # Everything else that is a number is a count, a length, a weight or a rate: never negative.
     Range("*", low=0),
 )
@@ -111,10 +147,19 @@ def range_of(key: str) -> Range:
     return next(r for r in RANGES if fnmatchcase(key, r.pattern))
 
 
+def _scalars(value: Any) -> Iterator[Any]:
+    """The items of a list of any depth; anything else is its own only item."""
+    if isinstance(value, list):
+        for item in value:
+            yield from _scalars(item)
+    else:
+        yield value
+
+
 def violation(key: str, value: Any) -> str:
     """One sentence when ``value`` (a scalar or a list of them) is out of range, else an empty string."""
     allowed = range_of(key)
-    for item in value if isinstance(value, list) else [value]:
+    for item in _scalars(value):
         if not allowed.accepts(item):
             close = get_close_matches(str(item), allowed.options, n=1)
             return f"{key} must be {allowed}; got {item!r}" + (f", did you mean {close[0]!r}?" if close else "")

@@ -1,0 +1,49 @@
+"""Train a part's network: generate what is missing, train, validate, test, track.
+
+    make train OBJECT=connecting_rod [ARGS="trainer.max_epochs=20 seed=1"]
+
+The default preset follows the hardware: compact on a CPU, gpu where there is a GPU; ARGS="experiment=paper" is the
+paper's. Interrupted, also by kill -9, the same command goes on where it was, in the same MLflow run; a training that
+is complete is not repeated without force=true.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from command import command, configuring
+from omegaconf import DictConfig
+
+log = logging.getLogger("attentionvote.train")
+
+
+def run(cfg: DictConfig) -> dict[str, Any]:
+    """Generate, train, test; the test figures and where the checkpoint is."""
+    from training_run import TrainingRun, build_part, find_training
+
+    with configuring(f"object {cfg.object.name}"):
+        part = build_part(cfg)
+    with configuring():
+        job = find_training(cfg, part)
+    if job.result is not None and not cfg.force:
+        log.info("this training is complete (force=true repeats it): %s", job.directory)
+        return job.result
+    with configuring():
+        training = TrainingRun(cfg, part, job)
+    return training.run()
+
+
+def preset_of_hardware(words: list[str]) -> list[str]:
+    """``experiment=gpu`` where an NVIDIA driver is loaded, else ``experiment=compact``, unless the user named one."""
+    if any(word.lstrip("+~").startswith("experiment") for word in words):
+        return []
+    gpu = Path("/proc/driver/nvidia/version").exists()
+    preset, reason = ("gpu", "an NVIDIA driver was found") if gpu else ("compact", "no GPU was found")
+    log.info("experiment=%s (%s; experiment=... chooses another)", preset, reason)
+    return [f"experiment={preset}"]
+
+
+if __name__ == "__main__":
+    command("train", run, defaults=preset_of_hardware)

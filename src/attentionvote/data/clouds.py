@@ -1,0 +1,203 @@
+"""Point clouds of a scene set, measured once and kept on disk for all epochs.
+
+Casting the rays and estimating the normals costs a few hundred milliseconds a scene, drawing a sample from the
+stored cloud a few; so every scene is measured once with the sensor's noise, and a pool of its points is kept with
+normals estimated on the whole (denser) cloud. A sample of an epoch is a random part of the pool.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
+from attentionvote.part import Part
+from attentionvote.scene import Scene
+from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor, synthesize
+
+_VERSION = 1
+_SCENES_PER_TASK = 4
+
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """What is measured of a scene.
+
+    Args:
+        sensor: the sensor and its noise.
+        density: most points of the cloud on which normals are estimated; the cell must use the same.
+        pool: points kept of it.
+        neighbors: of the normal estimation.
+    """
+
+    sensor: Sensor
+    density: int = 40_000
+    pool: int = 16_384
+    neighbors: int = 30
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.pool <= self.density:
+            raise ValueError(f"pool must lie in 1..{self.density} (density), got {self.pool}")
+
+    def key(self, scene_digest: str) -> str:
+        """Digest of everything that determines the stored clouds."""
+        content = json.dumps([_VERSION, scene_digest, asdict(self)], sort_keys=True, default=str)
+        return hashlib.sha256(content.encode()).hexdigest()
+
+
+class Clouds:
+    """The measured clouds of a scene set; ``clouds[i]`` is scene i as a ``Scene`` with normals.
+
+    Args:
+        directory: where ``measure_clouds`` put them.
+        scenes: the scene set they belong to.
+    """
+
+    def __init__(self, directory: Path, scenes: SceneSet) -> None:
+        self.directory = directory
+        self.records: list[SceneRecord] = list(scenes.records)
+        self._arrays = _open_arrays(directory, "r")
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def count(self, index: int) -> int:
+        """Number of points of scene ``index``."""
+        return int(self._arrays["count"][index])
+
+    def __getitem__(self, index: int) -> Scene:
+        record = self.records[index]
+        count = self.count(index)
+        normals = self._arrays["normals"][index, :count].astype(np.float32) / 127.0
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return Scene(
+            points=np.array(self._arrays["points"][index, :count]),
+            normals=normals / np.maximum(length, 1e-6),
+            instance_ids=self._arrays["instance_ids"][index, :count].astype(np.int32),
+            camera_from_part=record.camera_from_part,
+            visible_fraction=record.visible_fraction,
+            part_ids=np.zeros(len(record.camera_from_part), dtype=np.int32),
+        )
+
+
+def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> Scene:
+    """One scene as the network will see it: noisy points of the pool with normals from the whole cloud.
+
+    The random numbers come from the scene's own seed, so the cloud does not depend on who measures it and when.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
+    scene = synthesize(record, caster, settings.sensor, settings.density, rng)
+    if len(scene.points) < 3:
+        empty = np.zeros((0, 3), dtype=np.float32)
+        return Scene(empty, np.zeros(0, np.int32), scene.camera_from_part, scene.visible_fraction, scene.part_ids, empty)
+    kept = sample_indices(len(scene.points), min(settings.pool, len(scene.points)), rng)
+    points = scene.points[kept]
+    normals = estimate_normals(scene.points, points, settings.neighbors)
+    ids = scene.instance_ids[kept]
+    return Scene(points, ids, scene.camera_from_part, scene.visible_fraction, scene.part_ids, normals)
+
+
+def measure_clouds(
+    scenes: SceneSet, part: Part, settings: CloudSettings, root: Path, workers: int, progress: bool = True
+) -> Clouds:
+    """Measure what is missing of a scene set's clouds and open them.
+
+    A scene's row is written before its mark, so that an interrupted call, also by kill -9, goes on where it was.
+
+    Args:
+        scenes: the scene set.
+        part: its part.
+        settings: sensor, density, pool.
+        root: clouds are kept in ``root/<part>/<key>``.
+        workers: processes.
+        progress: show a progress bar on stderr.
+    """
+    directory = root / part.name / settings.key(scenes.digest)[:16]
+    if not (directory / "count.npy").exists():
+        _create_arrays(directory, len(scenes), settings.pool)
+    done = _open_arrays(directory, "r")["done"]
+    missing = [int(i) for i in np.flatnonzero(done == 0)]
+    tasks = [missing[i : i + _SCENES_PER_TASK] for i in range(0, len(missing), _SCENES_PER_TASK)]
+    if tasks:
+        results = _run(tasks, workers, (directory, scenes, part, settings))
+        if progress:
+            from rich.console import Console
+            from rich.progress import track
+
+            results = track(results, f"{part.name}: measuring clouds", len(tasks), console=Console(stderr=True))
+        for _ in results:
+            pass
+    return Clouds(directory, scenes)
+
+
+_Job = tuple[Path, SceneSet, Part, CloudSettings]
+_worker: Callable[[list[int]], None] | None = None
+
+
+def _run(tasks: list[list[int]], workers: int, job: _Job) -> Iterator[None]:
+    if workers <= 1:
+        _start_worker(*job)
+        assert _worker is not None
+        yield from map(_worker, tasks)
+        return
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=job) as pool:
+        futures = [pool.submit(_work, task) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _work(task: list[int]) -> None:
+    assert _worker is not None
+    _worker(task)
+
+
+def _start_worker(directory: Path, scenes: SceneSet, part: Part, settings: CloudSettings) -> None:
+    global _worker
+    arrays, caster = _open_arrays(directory, "r+"), PartCaster(part)
+
+    def work(task: list[int]) -> None:
+        for index in task:
+            scene = measure(scenes.records[index], caster, settings)
+            count = len(scene.points)
+            assert scene.normals is not None
+            arrays["points"][index, :count] = scene.points
+            arrays["normals"][index, :count] = np.round(scene.normals * 127)
+            arrays["instance_ids"][index, :count] = scene.instance_ids
+            arrays["count"][index] = count
+            arrays["done"][index] = 1
+
+    _worker = work
+
+
+def _create_arrays(directory: Path, scenes: int, pool: int) -> None:
+    directory.mkdir(parents=True, exist_ok=True)
+    shapes: dict[str, tuple[tuple[int, ...], type]] = {
+        "points": ((scenes, pool, 3), np.float32),
+        "normals": ((scenes, pool, 3), np.int8),
+        "instance_ids": ((scenes, pool), np.int16),
+        "done": ((scenes,), np.uint8),
+        "count": ((scenes,), np.int32),  # last: its presence says that all are there
+    }
+    for name, (shape, dtype) in shapes.items():
+        temporary = directory / f".{name}.{os.getpid()}"
+        np.lib.format.open_memmap(temporary, mode="w+", dtype=dtype, shape=shape).flush()
+        temporary.replace(directory / f"{name}.npy")
+
+
+def _open_arrays(directory: Path, mode: str) -> dict[str, NDArray]:
+    names = ("points", "normals", "instance_ids", "done", "count")
+    return {name: np.load(directory / f"{name}.npy", mmap_mode=mode) for name in names}  # type: ignore[arg-type]

@@ -1,0 +1,112 @@
+"""Batches of a part's scenes for training and validation, reproducible from the seed alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import lightning as L
+import numpy as np
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from attentionvote.data.clouds import Clouds
+from attentionvote.data.samples import Augmentation, Batch, collate, draw_sample
+from attentionvote.model import Layout
+
+
+class CloudSamples(Dataset[Batch]):
+    """Samples of measured clouds; an item is named by (epoch, scene), which seeds everything random in it.
+
+    So a sample does not depend on which worker draws it, or on what was drawn before: a continued training sees
+    what an uninterrupted one would have seen.
+    """
+
+    def __init__(self, clouds: Clouds, points: int, layout: Layout, augmentation: Augmentation | None, seed: int) -> None:
+        self.clouds, self.points, self.layout = clouds, points, layout
+        self.augmentation, self.seed = augmentation, seed
+        self.scenes = [i for i in range(len(clouds)) if clouds.count(i) >= 3]
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, item: int | tuple[int, int]) -> Batch:
+        epoch, index = item if isinstance(item, tuple) else (0, item)
+        rng = np.random.default_rng([self.seed, epoch, index])
+        return draw_sample(self.clouds[self.scenes[index]], self.points, self.layout, self.augmentation, rng)
+
+
+class EpochSampler(Sampler[tuple[int, int]]):
+    """(epoch, scene) in an order that depends on the seed and the epoch only; Lightning calls ``set_epoch``."""
+
+    def __init__(self, size: int, seed: int) -> None:
+        self.size, self.seed, self.epoch = size, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Which epoch the next pass is."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
+        return ((self.epoch, int(index)) for index in order)
+
+
+class PartDataModule(L.LightningDataModule):
+    """Training, validation and test batches of one part.
+
+    Args:
+        train, val, test: measured clouds of scene sets that share no drop cycle.
+        points: N, points a sample.
+        layout: of the network, for the neighbourhoods.
+        batch_size: scenes a step.
+        workers: loader processes.
+        augmentation: of training samples.
+        seed: of everything random.
+    """
+
+    def __init__(
+        self,
+        train: Clouds,
+        val: Clouds,
+        test: Clouds,
+        points: int,
+        layout: Layout,
+        batch_size: int,
+        workers: int,
+        augmentation: Augmentation,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        if points < layout.centers[0]:
+            raise ValueError(f"points must be at least {layout.centers[0]} (centres of the first level), got {points}")
+        self.train = CloudSamples(train, points, layout, augmentation, seed)
+        self.val = CloudSamples(val, points, layout, None, seed)
+        self.test = CloudSamples(test, points, layout, None, seed)
+        if len(self.train) < batch_size:
+            raise ValueError(f"batch_size must be at most the {len(self.train)} training scenes, got {batch_size}")
+        self.batch_size, self.workers, self.seed = batch_size, workers, seed
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Shuffled, augmented, full batches only."""
+        return DataLoader(
+            self.train,
+            batch_size=self.batch_size,
+            sampler=EpochSampler(len(self.train), self.seed),
+            collate_fn=collate,
+            num_workers=self.workers,
+            persistent_workers=self.workers > 0,
+            prefetch_factor=4 if self.workers else None,
+            drop_last=True,
+        )
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """The validation scenes, always the same samples."""
+        return self._plain(self.val)
+
+    def test_dataloader(self) -> DataLoader[Batch]:
+        """The test scenes, always the same samples."""
+        return self._plain(self.test)
+
+    def _plain(self, samples: CloudSamples) -> DataLoader[Batch]:
+        return DataLoader(samples, batch_size=self.batch_size, collate_fn=collate, num_workers=0)

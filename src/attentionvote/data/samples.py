@@ -1,0 +1,121 @@
+"""One training sample, its augmentation, and the batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from attentionvote.geometry.pointcloud import sample_indices
+from attentionvote.geometry.pose import rotation_about
+from attentionvote.model import Layout, Neighborhoods, find_neighborhoods
+from attentionvote.scene import Scene
+
+
+class Batch(NamedTuple):
+    """Samples with their ground truth; instances are padded to the largest number in the batch.
+
+    Attributes:
+        points, normals: ``(batch, N, 3)`` camera frame, metres.
+        instance: ``(batch, N)`` instance of each point, -1 for none.
+        found: neighbourhoods of the points.
+        center: ``(batch, I, 3)`` origins of the instances, camera frame.
+        rotation: ``(batch, I, 3, 3)`` ``camera_from_part``.
+        visible: ``(batch, I)`` visible fraction, 0 where padded.
+        part: ``(batch, I)`` index of the part.
+    """
+
+    points: Tensor
+    normals: Tensor
+    instance: Tensor
+    found: Neighborhoods
+    center: Tensor
+    rotation: Tensor
+    visible: Tensor
+    part: Tensor
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Random motion of a training sample about its centroid.
+
+    Args:
+        roll: whether to turn it by any angle about the optical axis.
+        tilt: standard deviation in radians of a turn about a random axis in the image plane.
+        jitter_mm: standard deviation of extra point noise, added after the normals were estimated.
+    """
+
+    roll: bool = True
+    tilt: float = 0.15
+    jitter_mm: float = 0.0
+
+    def apply(
+        self, points: NDArray[np.float32], normals: NDArray[np.float32], poses: NDArray[np.float64], rng: np.random.Generator
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+        """Moved points ``(N, 3)``, normals ``(N, 3)`` and poses ``(I, 4, 4)``."""
+        turn = rotation_about([0, 0, 1], rng.uniform(0, 2 * np.pi) if self.roll else 0.0)
+        direction = rng.uniform(0, 2 * np.pi)
+        turn = rotation_about([np.cos(direction), np.sin(direction), 0], rng.normal(0, self.tilt)) @ turn
+        middle = points.mean(axis=0, dtype=np.float64)
+        turn32 = turn.T.astype(np.float32)
+        moved = (points - middle.astype(np.float32)) @ turn32 + middle.astype(np.float32)
+        if self.jitter_mm:
+            moved = moved + rng.normal(0, self.jitter_mm / 1000, moved.shape).astype(np.float32)
+        turned_poses = poses.copy()
+        turned_poses[:, :3, :3] = turn @ poses[:, :3, :3]
+        turned_poses[:, :3, 3] = (poses[:, :3, 3] - middle) @ turn.T + middle
+        return moved, normals @ turn32, turned_poses
+
+
+def draw_sample(
+    scene: Scene, count: int, layout: Layout, augmentation: Augmentation | None, rng: np.random.Generator
+) -> Batch:
+    """A batch of one without the batch dimension: ``count`` random points of a scene, moved, with neighbourhoods.
+
+    Raises:
+        ValueError: when the scene is empty or has no normals.
+    """
+    if scene.normals is None:
+        raise ValueError("a scene must have normals before it is sampled, got none: estimate_normals first")
+    chosen = sample_indices(len(scene.points), count, rng)
+    points, normals, poses = scene.points[chosen], scene.normals[chosen], scene.camera_from_part
+    if augmentation is not None:
+        points, normals, poses = augmentation.apply(points, normals, poses, rng)
+    return Batch(
+        torch.from_numpy(np.ascontiguousarray(points)),
+        torch.from_numpy(np.ascontiguousarray(normals)),
+        torch.from_numpy(scene.instance_ids[chosen].astype(np.int64)),
+        find_neighborhoods(points, layout),
+        torch.from_numpy(poses[:, :3, 3].astype(np.float32)),
+        torch.from_numpy(poses[:, :3, :3].astype(np.float32)),
+        torch.from_numpy(scene.visible_fraction.astype(np.float32)),
+        torch.from_numpy(scene.part_ids.astype(np.int64)),
+    )
+
+
+def collate(samples: Sequence[Batch]) -> Batch:
+    """Stack samples; instances are padded with identity rotations, zero centres and visibility 0."""
+    most = max(1, *(len(s.center) for s in samples)) if samples else 1
+
+    def padded(name: str, fill: Tensor) -> Tensor:
+        rows = []
+        for sample in samples:
+            value: Tensor = getattr(sample, name)
+            rows.append(torch.cat([value, fill.to(value.dtype).expand(most - len(value), *value.shape[1:])]))
+        return torch.stack(rows)
+
+    return Batch(
+        torch.stack([s.points for s in samples]),
+        torch.stack([s.normals for s in samples]),
+        torch.stack([s.instance for s in samples]),
+        Neighborhoods.stack([s.found for s in samples]),
+        padded("center", torch.zeros(3)),
+        padded("rotation", torch.eye(3)),
+        padded("visible", torch.zeros(())),
+        padded("part", torch.zeros(())),
+    )

@@ -1,0 +1,35 @@
+"""From the network's answers to what the evaluation compares with the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from attentionvote.data.samples import Batch
+from attentionvote.evaluation import SceneResult
+from attentionvote.geometry.pose import matrix_from_quaternion, transform
+from attentionvote.model import Predictions
+
+
+def scene_results(
+    predictions: Predictions, batch: Batch, peak_threshold: float, confidence_threshold: float = 0.0
+) -> list[SceneResult]:
+    """Detections and truth of every sample of a batch.
+
+    Args:
+        predictions: of the batch.
+        batch: with the truth; padded instances (visibility 0 at an identity pose at the origin) are left out.
+        peak_threshold: proposals with less heat are dropped (the paper's 0.4).
+        confidence_threshold: proposals with less confidence are dropped.
+    """
+    results = []
+    heat, confidence = predictions.peak_heat.cpu().numpy(), predictions.confidence.cpu().numpy()
+    rotation = matrix_from_quaternion(predictions.quaternion.double().cpu().numpy())
+    poses = transform(rotation, predictions.center.double().cpu().numpy())
+    kept = (heat >= peak_threshold) & (confidence >= confidence_threshold)
+    truth = transform(batch.rotation.double().cpu().numpy(), batch.center.double().cpu().numpy())
+    real = (batch.center.abs().sum(-1) > 0).cpu().numpy()
+    visible = batch.visible.double().cpu().numpy()
+    for i in range(len(poses)):
+        occlusion = 1.0 - np.minimum(visible[i, real[i]], 1.0)
+        results.append(SceneResult(poses[i, kept[i]], confidence[i, kept[i]], truth[i, real[i]], occlusion))
+    return results

@@ -1,0 +1,194 @@
+"""The losses of the paper (section 3.4, Eqs. 1-11) and the dense supervision that trains faster beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from attentionvote.data.samples import Batch
+from attentionvote.model import AttentionVote, Peaks, Poses, Votes
+from attentionvote.part import Part
+from attentionvote.training.pose_loss import RotationLoss, SymmetricPose
+
+QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
+
+
+class Assignment(NamedTuple):
+    """Which instance every proposal row is trained towards.
+
+    Attributes:
+        sample: ``(rows,)`` sample of the batch.
+        instance: ``(rows,)`` nearest visible instance.
+        positive: ``(rows,)`` whether it is near enough to be supervised.
+    """
+
+    sample: Int[Tensor, "rows"]
+    instance: Int[Tensor, "rows"]
+    positive: Bool[Tensor, "rows"]
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Choices of the loss; the terms' weights are a mapping beside it.
+
+    Args:
+        rotation: see ``pose_loss``.
+        isotropic: share of D added to Lambda in the ``metric`` rotation loss.
+        assignment: a proposal is positive when its centre seed lies within this share of D of an instance.
+        least_visible: instances with less visible fraction are never assigned.
+        confidence: ``exponential`` (Eq. 10) or ``quality``: expected share of the thresholds 2, 5 and 10 % D that
+            the pose meets, learned as a probability; proposals that match nothing and all but the best of several on
+            one instance count as 0.
+        detach_confidence: whether Eq. 10 leaves the pose's gradient alone (paper-decisions, row 33).
+    """
+
+    rotation: RotationLoss = "metric"
+    isotropic: float = 0.1
+    assignment: float = 0.2
+    least_visible: float = 0.05
+    confidence: Literal["exponential", "quality"] = "quality"
+    detach_confidence: bool = True
+
+
+class AttentionVoteLoss:
+    """All loss terms of one batch; the total is the weighted sum of the terms by name.
+
+    Lengths are divided by 0.1 D, the limit of the evaluation, so that every term is of order one at the limit.
+
+    Args:
+        part: diameter and symmetry.
+        weights: weight of each term: ``vote`` (Eq. 1), ``vote_rotation`` (dense supervision: every vote's own
+            rotation), ``center``, ``rotation``, ``semantic`` (Eq. 9), ``confidence`` (Eq. 10), ``refined`` (pose
+            after the refinement). A weight of 0 leaves a term out.
+        settings: the choices.
+    """
+
+    TERMS = ("vote", "vote_rotation", "center", "rotation", "semantic", "confidence", "refined")
+
+    def __init__(self, part: Part, weights: Mapping[str, float], settings: LossSettings) -> None:
+        unknown = sorted(set(weights) - set(self.TERMS))
+        if unknown:
+            raise ValueError(f"loss weights must be among {', '.join(self.TERMS)}, got {', '.join(unknown)}")
+        self.weights, self.settings = dict(weights), settings
+        self.unit = 0.1 * part.diameter
+        self.training_pose = SymmetricPose.of(part, settings.isotropic)
+        self.true_pose = SymmetricPose.of(part)
+
+    def total(self, terms: Mapping[str, Tensor], ramp: float = 1.0) -> Tensor:
+        """Weighted sum; ``ramp`` in [0, 1] scales all terms but the votes' (warm-up)."""
+        weighted = [self.weights.get(k, 0.0) * v * (1.0 if k.startswith("vote") else ramp) for k, v in terms.items()]
+        return torch.stack(weighted).sum()
+
+    def vote_terms(self, votes: Votes, batch: Batch) -> dict[str, Tensor]:
+        """Eq. (1), mean over the seeds that lie on an instance, and the votes' rotations."""
+        instance = torch.take_along_dim(batch.instance, votes.seed_index, dim=1)
+        on_part = instance >= 0
+        index = instance.clamp(min=0)
+        rows = torch.arange(len(index), device=index.device)[:, None]
+        aim = batch.center[rows, index]
+        error = ((votes.xyz - aim).square().sum(-1) + 1e-12).sqrt() / self.unit
+        terms = {"vote": masked_mean(error, on_part)}
+        if votes.rotation is not None:
+            turn = self.training_pose.rotation_loss(
+                "metric", votes.rotation.new_zeros(0, 4), votes.rotation.flatten(0, 1), batch.rotation[rows, index].flatten(0, 1)
+            )
+            terms["vote_rotation"] = masked_mean(turn.view_as(error), on_part)
+        return terms
+
+    def assign(self, peaks: Peaks, batch: Batch, rows: Int[Tensor, "rows"]) -> Assignment:
+        """The nearest visible instance of every proposal (paper, "Assigning instance labels")."""
+        sample = rows // peaks.heat.shape[1]
+        seed = peaks.center_seed.flatten(0, 1)[rows]
+        distance = (seed[:, None] - batch.center[sample]).norm(dim=-1)
+        distance = distance.masked_fill(batch.visible[sample] < self.settings.least_visible, torch.inf)
+        nearest, instance = distance.min(dim=1)
+        return Assignment(sample, instance, nearest < self.settings.assignment * 10 * self.unit)
+
+    def proposal_terms(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
+        """Eq. (9) of the positive proposals, term by term, mean over them."""
+        center, rotation = self._truth(assigned, batch)
+        settings = self.settings
+        apart = ((poses.center - center).square().sum(-1) + 1e-12).sqrt() / self.unit
+        turn = self.training_pose.rotation_loss(settings.rotation, poses.quaternion, poses.rotation, rotation)
+        terms = {"center": masked_mean(apart, assigned.positive), "rotation": masked_mean(turn, assigned.positive)}
+        semantic = torch.zeros_like(apart)
+        if poses.class_logits.shape[1] > 1:
+            part = batch.part[assigned.sample, assigned.instance]
+            semantic = torch.nn.functional.cross_entropy(poses.class_logits, part, reduction="none")
+            terms["semantic"] = masked_mean(semantic, assigned.positive)
+        if settings.confidence == "exponential":
+            weights = {k: self.weights.get(k, 0.0) for k in ("center", "rotation", "semantic")}
+            instance = weights["center"] * apart + weights["rotation"] * turn + weights["semantic"] * semantic
+            instance = instance.detach() if settings.detach_confidence else instance
+            score = poses.score.clamp(-8, 8)
+            terms["confidence"] = masked_mean(instance * score.exp() - score, assigned.positive)
+        return terms
+
+    def refined_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
+        """Distance after the refinement: centre and rotation together, as the evaluation measures it."""
+        center, rotation = self._truth(assigned, batch)
+        turn = self.training_pose.squared_turn(poses.rotation, rotation)
+        squared = turn + (poses.center - center).square().sum(-1)
+        return {"refined": masked_mean((squared + 1e-10).sqrt() / self.unit, assigned.positive)}
+
+    def quality_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
+        """Cross entropy between the predicted and the measured quality of every proposal."""
+        with torch.no_grad():
+            quality = self.quality(poses, assigned, batch)
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(poses.score, quality, reduction="none")
+        return {"confidence": loss.mean() if len(loss) else poses.score.sum()}
+
+    def quality(self, poses: Poses, assigned: Assignment, batch: Batch) -> Float[Tensor, "rows"]:
+        """Share of the thresholds 2, 5, 10 % D that each pose meets, 0 for all but the best on an instance."""
+        distance = self.true_pose.distance(poses.center, poses.rotation, *self._truth(assigned, batch))
+        distance = distance.masked_fill(~assigned.positive, torch.inf)
+        steps = torch.tensor(QUALITY_STEPS, device=distance.device) * (10 * self.unit)
+        quality = (distance[:, None] < steps).to(poses.score.dtype).mean(1)
+        key = assigned.sample * batch.visible.shape[1] + assigned.instance
+        best = torch.full((int(batch.visible.numel()),), torch.inf, device=distance.device)
+        best = best.scatter_reduce(0, key, distance, "amin")
+        return quality * (distance <= best[key])
+
+    def _truth(self, assigned: Assignment, batch: Batch) -> tuple[Tensor, Tensor]:
+        at = assigned.sample, assigned.instance
+        return batch.center[at], batch.rotation[at]
+
+
+def batch_loss(
+    model: AttentionVote, loss: AttentionVoteLoss, batch: Batch, ramp: float, least_heat: float
+) -> dict[str, Tensor]:
+    """All loss terms of one batch (Eq. 11).
+
+    Args:
+        ramp: 0 during the warm-up, when only the votes are trained; the proposals are then not computed at all.
+        least_heat: proposals with less heat are left out of training.
+    """
+    votes = model.cast_votes(batch.points, batch.normals, batch.found)
+    terms = loss.vote_terms(votes, batch)
+    if ramp <= 0:
+        return terms
+    peaks = model.find_peaks(votes)
+    rows = torch.nonzero(peaks.heat.flatten() >= least_heat)[:, 0]
+    if len(rows) < 2:  # batch statistics need two rows
+        return terms
+    poses = model.regress(votes, peaks, rows)
+    assigned = loss.assign(peaks, batch, rows)
+    terms |= loss.proposal_terms(poses, assigned, batch)
+    final = poses
+    if model.refiner is not None:
+        final = model.refine(batch.points, batch.normals, assigned.sample, poses)
+        terms |= loss.refined_term(final, assigned, batch)
+    if loss.settings.confidence == "quality":
+        terms |= loss.quality_term(final, assigned, batch)
+    return terms
+
+
+def masked_mean(values: Float[Tensor, "*rows"], mask: Bool[Tensor, "*rows"]) -> Float[Tensor, ""]:
+    """Mean of the values where ``mask`` holds; 0 with gradient 0 where it never does."""
+    weight = mask.to(values.dtype)
+    return (values.masked_fill(~mask, 0.0) * weight).sum() / weight.sum().clamp(min=1.0)

@@ -1,0 +1,112 @@
+"""The Lightning shell around the network: steps, optimiser, validation by average precision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from attentionvote.data.samples import Batch
+from attentionvote.evaluation import SceneResult, evaluate
+from attentionvote.model import AttentionVote, Predictions
+from attentionvote.part import Part
+from attentionvote.training.detections import scene_results
+from attentionvote.training.losses import AttentionVoteLoss, batch_loss
+from attentionvote.training.schedule import Schedule
+
+
+class PoseTraining(L.LightningModule):
+    """Trains one network for one part.
+
+    Args:
+        model: the network.
+        loss: its losses.
+        part: for the metrics.
+        schedule: learning rate and warm-up.
+        optimizer: ``adam`` (the paper's) or ``adamw``.
+        learning_rate, weight_decay: of the optimiser.
+        peak_threshold: heat a proposal needs to count at validation (paper: 0.4).
+        train_heat: heat a proposal needs to be trained on.
+    """
+
+    def __init__(
+        self,
+        model: AttentionVote,
+        loss: AttentionVoteLoss,
+        part: Part,
+        schedule: Schedule,
+        optimizer: str = "adam",
+        learning_rate: float = 1e-3,
+        weight_decay: float = 0.0,
+        peak_threshold: float = 0.4,
+        train_heat: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.model, self.loss, self.part, self.schedule = model, loss, part, schedule
+        self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
+        self.peak_threshold, self.train_heat = peak_threshold, train_heat
+        self.voting_radius = model.voting_radius
+        self.results: list[SceneResult] = []
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        """One step; logs every term of the loss under ``train/loss/``."""
+        ramp = self.schedule.ramp(self.global_step)
+        self.model.voting_radius = self.voting_radius * (self.schedule.vote_radius_factor if ramp < 1 else 1.0)
+        terms = batch_loss(self.model, self.loss, batch, ramp, self.train_heat)
+        total = self.loss.total(terms, ramp)
+        self.log_dict(
+            {f"train/loss/{k}": v.detach() for k, v in terms.items()} | {"train/loss": total.detach()},
+            batch_size=len(batch.points),
+        )
+        self.log("vote", terms["vote"].detach(), prog_bar=True, logger=False, batch_size=len(batch.points))
+        return total
+
+    def on_validation_epoch_start(self) -> None:
+        """Inference looks at votes within the test radius."""
+        self.model.voting_radius = self.voting_radius
+        self.results = []
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        """Collect the detections of a batch."""
+        self.results += self.detect(batch)
+
+    def on_validation_epoch_end(self) -> None:
+        """Average precision at 10, 5 and 2 % of the diameter over all validation scenes."""
+        metrics = evaluate(self.results, self.part, add=False)
+        self.log_dict({f"val/{k}": v for k, v in metrics.items()})
+        self.log("val/ap", (metrics["ap_10"] + metrics["ap_5"] + metrics["ap_2"]) / 3)
+        for name in ("ap_10", "ap_5", "ap_2"):
+            self.log(name, metrics[name], prog_bar=True, logger=False)
+
+    on_test_epoch_start = on_validation_epoch_start
+    test_step = validation_step
+
+    def on_test_epoch_end(self) -> None:
+        """All figures of the test scenes."""
+        self.log_dict({f"test/{k}": v for k, v in evaluate(self.results, self.part).items()})
+
+    @torch.no_grad()
+    def detect(self, batch: Batch) -> list[SceneResult]:
+        """Detections of a batch beside its truth."""
+        predictions: Predictions = self.model(batch.points, batch.normals, batch.found)
+        return scene_results(predictions, batch, self.peak_threshold)
+
+    def configure_optimizers(self) -> Any:
+        """Adam or AdamW (no decay on biases and norms) with the schedule's rate, changed every step."""
+        decayed = [p for p in self.parameters() if p.ndim > 1]
+        plain = [p for p in self.parameters() if p.ndim <= 1]
+        groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": plain, "weight_decay": 0.0}]
+        kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.optimizer]
+        optimizer = kind(groups, lr=self.learning_rate, foreach=True)
+        total = int(self.trainer.estimated_stepping_batches)
+        per_epoch = max(1, int(self.trainer.num_training_batches))
+        factor = self.schedule.rate_factor(total, per_epoch)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, _: int) -> Batch:
+        """Neighbourhoods are nested tuples, which Lightning would rebuild as lists."""
+        moved = {k: getattr(batch, k).to(device) for k in batch._fields}
+        return Batch(**moved)

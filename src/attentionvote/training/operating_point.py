@@ -1,0 +1,41 @@
+"""Which confidence a detection must have: chosen on validation scenes, kept with the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from attentionvote.evaluation import PoseMetric, SceneResult, match
+from attentionvote.part import Part
+
+THRESHOLDS = tuple(np.round(np.linspace(0.0, 0.9, 37), 3))
+
+
+def confident(scenes: Sequence[SceneResult], threshold: float) -> list[SceneResult]:
+    """The same scenes with only the detections of at least this confidence."""
+    kept = [scene.scores >= threshold for scene in scenes]
+    return [
+        SceneResult(s.poses[k], s.scores[k], s.gt_poses, s.gt_occlusion) for s, k in zip(scenes, kept, strict=True)
+    ]
+
+
+def best_threshold(scenes: Sequence[SceneResult], part: Part, fraction: float = 0.1) -> float:
+    """The confidence threshold with the best F1 at ``fraction`` x D, the lowest of equals.
+
+    Args:
+        scenes: validation scenes with all detections, so that the test scenes stay unseen.
+    """
+    metric = PoseMetric.of(part)
+    best, best_f1 = 0.0, -1.0
+    for threshold in THRESHOLDS:
+        right = wrong = missed = 0
+        for scene in confident(scenes, threshold):
+            distances = metric.distances(scene.poses, scene.gt_poses)
+            found = match(distances, scene.scores, scene.to_find(), fraction * part.diameter)
+            right += len(found.true_positives)
+            wrong, missed = wrong + len(found.false_positives), missed + len(found.misses)
+        f1 = 2 * right / max(1, 2 * right + wrong + missed)
+        if f1 > best_f1 + 1e-9:
+            best, best_f1 = float(threshold), f1
+    return best
