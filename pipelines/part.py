@@ -1,0 +1,169 @@
+"""Add your own part: checks the mesh, finds diameter, frame and symmetry, writes conf/object/NAME.yaml.
+
+make part NAME=widget MESH=widget.stl [UNITS=mm]; then: make train OBJECT=widget
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from command import ConfigurationError, command, configuring
+from omegaconf import DictConfig
+
+if TYPE_CHECKING:
+    from attentionvote.part import Part
+    from attentionvote.simulation.symmetry_detection import SymmetryFinding
+
+log = logging.getLogger("attentionvote.part")
+
+NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
+
+def run(cfg: DictConfig) -> dict[str, Any]:
+    """Write mesh, picture and, last, the configuration; the figures and the paths."""
+    name, config = _checked_name(cfg), Path(cfg.objects) / f"{cfg.name}.yaml"
+    if not cfg.mesh:
+        raise ConfigurationError("mesh must be given, e.g. mesh=widget.stl")
+    if config.exists() and not cfg.force:
+        raise ConfigurationError(f"object {name!r} exists already ({config}), add force=true to replace it")
+
+    from attentionvote.geometry import pose
+    from attentionvote.part import Part
+    from attentionvote.simulation.mesh import largest_vertex_distance, load_surface, write_surface
+    from attentionvote.simulation.part_picture import write_picture
+    from attentionvote.simulation.symmetry_detection import describe, detect_symmetry
+
+    with configuring():
+        vertices, faces = load_surface(cfg.mesh, cfg.units)
+        diameter = largest_vertex_distance(vertices)
+        size = " x ".join(f"{e * 1000:.1f}" for e in vertices.max(0) - vertices.min(0))
+        log.info("%s: %d triangles, %s mm, D %.2f mm; looking for symmetries", name, len(faces), size, diameter * 1e3)
+        finding = detect_symmetry(vertices, faces, cfg.tolerance)
+    vertices = pose.apply(finding.part_from_file, vertices)
+    title = cfg.title or name.replace("_", " ").capitalize()
+    part = Part(name, vertices, faces, round(diameter, 9), finding.symmetry, str(title))
+    log.info("symmetry %s, residual %.3f mm", describe(finding.symmetry), finding.residual * 1e3)
+    if finding.moved:
+        log.info("the part frame is not the file's: see part_from_file in %s", config)
+
+    mesh, picture = Path(cfg.parts) / f"{name}.ply", Path(cfg.parts) / f"{name}.png"
+    _write(mesh, lambda path: write_surface(part.vertices, part.faces, path))
+    _write(picture, lambda path: write_picture(part, path))
+    text = configuration_text(part, finding, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
+    _write(config, lambda path: path.write_text(text, encoding="utf-8") and None)
+    log.info("look at %s, then: make train OBJECT=%s", picture, name)
+    return {
+        "stage": "part",
+        "object": name,
+        "config": str(config),
+        "mesh": str(mesh),
+        "picture": str(picture),
+        "triangles": len(part.faces),
+        "diameter": part.diameter,
+        "covariance_root": part.covariance_root.round(9),
+        "symmetry": _symmetry_settings(part),
+        "symmetry_residual": finding.residual,
+        "symmetry_tolerance": finding.tolerance,
+        "runner_up": finding.runner_up,
+        "runner_up_residual": finding.runner_up_residual if finding.runner_up_residual < 1e9 else None,
+        "moved": finding.moved,
+        "part_from_file": finding.part_from_file.round(9),
+    }
+
+
+def configuration_text(part: Part, finding: SymmetryFinding, mesh: Path, source: str) -> str:
+    """The object's configuration file, every figure with what it is and how it was found."""
+    from attentionvote.simulation.symmetry_detection import describe
+
+    d = part.diameter
+    root = "; ".join(" ".join(f"{v + 0.0:.7f}" for v in row) for row in part.covariance_root.round(7))
+    if finding.moved:
+        rows = "\n".join("#   " + " ".join(f"{v:12.9f}" for v in row) for row in finding.part_from_file + 0.0)
+        frame = (
+            "# Part frame: NOT the file's. Origin at the surface centroid, z along the symmetry axis, or the long\n"
+            f"# axis where there is none. part_from_file (metres) =\n{rows}\n"
+        )
+    else:
+        frame = "# Part frame: the file's own.\n"
+    if part.symmetry.kind == "none":
+        verified = "no rotation leaves the surface in place"
+    else:
+        verified = (
+            f"{describe(part.symmetry)}; every rotation checked leaves\n# the surface within "
+            f"{finding.residual * 1e3:.4f} mm ({finding.residual / d:.4%} of D) of itself"
+        )
+    rejected = "nothing else was near"
+    if finding.runner_up_residual < 1e9:
+        rejected = (
+            f"the best hypothesis rejected is\n# {finding.runner_up} (axis in the file's frame), "
+            f"which leaves it {finding.runner_up_residual * 1e3:.3f} mm ({finding.runner_up_residual / d:.2%} of D) away or more"
+        )
+    symmetry = "\n".join(f"  {key}: {json.dumps(value)}" for key, value in _symmetry_settings(part).items())
+    return f"""# {part.name}: made by `make part` from {source}.
+{frame}# Surface: {len(part.faces)} triangles, watertight. Lambda, the root of the surface covariance, metres, its rows:
+#   {root}
+_target_: attentionvote.simulation.load_part
+name: {part.name}
+title: {json.dumps(part.title, ensure_ascii=False)}
+mesh: {json.dumps(mesh.as_posix(), ensure_ascii=False)}
+units: m
+# Largest distance between two vertices, metres: the D of every threshold. Benchmarks may define it differently.
+diameter: {d!r}
+# Proper symmetry: {verified}
+# (tolerance {finding.tolerance * 1e3:.3f} mm, both ways); {rejected}.
+symmetry:
+{symmetry}
+# Scale settings in metres; null = derived from D by the documented rule.
+base_radius: null
+voxel_size: null
+"""
+
+
+def _symmetry_settings(part: Part) -> dict[str, Any]:
+    s = part.symmetry
+    settings: dict[str, Any] = {"kind": s.kind}
+    if s.kind in ("cyclic", "dihedral", "revolution"):
+        settings["axis"] = list(s.axis)
+    if s.kind in ("cyclic", "dihedral"):
+        settings["order"] = s.order
+    if s.kind == "dihedral":
+        settings["flip_axis"] = list(s.flip_axis)
+    if s.kind == "revolution":
+        settings["flip"] = s.flip
+    if s.kind == "group":
+        settings["quaternions"] = [list(q) for q in s.quaternions]
+    return settings
+
+
+def _checked_name(cfg: DictConfig) -> str:
+    name = str(cfg.name)
+    if not name:
+        raise ConfigurationError("name must be given, e.g. name=widget")
+    if not NAME.fullmatch(name):
+        nearest = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+        nearest = nearest if NAME.fullmatch(nearest) else f"part_{nearest}"[:64].rstrip("_")
+        raise ConfigurationError(
+            f"name must be small letters, digits and underscores, a letter first; got {name!r}, e.g. name={nearest}"
+        )
+    return name
+
+
+def _write(path: Path, write: Callable[[Path], None]) -> None:
+    """Whole or not at all: under another name first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    command("part", run)

@@ -1,0 +1,255 @@
+"""Detects the proper symmetry of a part, and verifies it against the surface.
+
+A symmetry leaves the surface centroid in place and commutes with the surface covariance, so the principal
+frame names nearly all candidates: three half turns where the principal moments differ, turns of any order
+about the single axis where two are equal, a search over all directions where all three are. What counts is
+only the check: every rotation of the group, applied to the surface, must leave it within ``tolerance``
+(0.3 % of the diameter by default) of itself everywhere, measured from dense points and corners to the exact
+surface, both ways. A faceted cylinder is therefore a body of revolution as soon as its facets' height is
+below the tolerance, and a part whose only asymmetry is a mark lower than that counts as symmetric.
+
+The part frame is the file's own wherever possible: the axis must pass through the file's origin (all axes,
+if there are several) and the origin must lie inside the bounding box. Otherwise the part is moved: origin
+at the surface centroid (it is on every axis), z along the symmetry axis (the longest principal axis without
+one), x along the next principal axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.geometry import pose
+from attentionvote.geometry.symmetry import Axis, Symmetry
+from attentionvote.part import surface_moments
+from attentionvote.simulation.mesh import largest_vertex_distance
+from attentionvote.simulation.part_frame import SNAP_ANGLE, axis_of, nearest_fixed_point, principal_frame, turned
+from attentionvote.simulation.surface_distance import RotationCheck
+from attentionvote.simulation.symmetry_search import closure, quaternions_of, refine_axis, search_axes
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 0.003  # of the diameter
+EQUAL_MOMENTS = 0.04  # relative difference of principal radii below which they may be equal
+LARGEST_ORDER = 180
+# Turns by multiples of the golden angle: no small part of a full turn, so no finite group contains them.
+REVOLUTION_ANGLES = np.mod(2 * np.pi * np.arange(1, 17) * (5**0.5 - 1) / 2, 2 * np.pi)
+
+
+@dataclass(frozen=True)
+class SymmetryFinding:
+    """What was found.
+
+    ``symmetry`` is in the part frame; ``part_from_file`` ``(4, 4)`` is the identity unless ``moved``.
+    ``residual`` (largest distance of a turned surface to itself over the whole group), ``tolerance`` and
+    ``runner_up_residual`` (of the best hypothesis that was rejected: a lower bound, its axis in the file's frame) are
+    metres.
+    """
+
+    symmetry: Symmetry
+    part_from_file: Array
+    moved: bool
+    residual: float
+    tolerance: float
+    runner_up: str
+    runner_up_residual: float
+
+
+def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float = TOLERANCE) -> SymmetryFinding:
+    """Find and verify the proper symmetry group of a surface and the part frame it is stated in.
+
+    Args:
+        vertices: ``(V, 3)`` metres, any frame.
+        faces: ``(F, 3)`` closed surface.
+        tolerance: largest distance between surface and turned surface, as a fraction of the largest
+            vertex distance.
+
+    Raises:
+        ValueError: on an impossible tolerance, or a ball (it has no orientation to estimate).
+    """
+    if not 0 < tolerance <= 0.05:
+        raise ValueError(f"symmetry tolerance must be above 0 and at most 0.05 of the diameter, got {tolerance}")
+    diameter = largest_vertex_distance(vertices)
+    _, centroid, covariance = surface_moments(vertices, faces)
+    check = RotationCheck(vertices - centroid, faces, tolerance * diameter)
+    detection = _Detection(check, covariance)
+    symmetry = _tidy(detection.group())
+    part_from_file = principal_frame(symmetry, vertices, centroid, covariance, diameter)
+    moved = not np.array_equal(part_from_file, np.eye(4))
+    # The last word: the symmetry exactly as it will be written, about the origin that it will be written for.
+    fixed_point = centroid if moved else nearest_fixed_point(symmetry, centroid)
+    final = RotationCheck(vertices - fixed_point, faces, tolerance * diameter, exact=0.01)
+    residual = max((final.residual(r) for r in tested_rotations(symmetry)), default=0.0)
+    runner_up, runner_up_residual = detection.runner_up()
+    return SymmetryFinding(
+        symmetry=turned(symmetry, part_from_file[:3, :3]),
+        part_from_file=part_from_file,
+        moved=moved,
+        residual=residual,
+        tolerance=tolerance * diameter,
+        runner_up=runner_up,
+        runner_up_residual=runner_up_residual,
+    )
+
+
+def symmetry_residual(vertices: Array, faces: NDArray[np.int64], symmetry: Symmetry) -> float:
+    """Largest distance in metres between the surface and its images under ``symmetry`` (about the origin)."""
+    tolerance = TOLERANCE * largest_vertex_distance(vertices)
+    check = RotationCheck(np.asarray(vertices, dtype=np.float64), faces, tolerance, exact=0.01)
+    return max((check.residual(r) for r in tested_rotations(symmetry)), default=0.0)
+
+
+def tested_rotations(symmetry: Symmetry) -> Array:
+    """The rotations ``(R, 3, 3)`` that are checked for ``symmetry``: all of a finite group but the identity,
+    16 incommensurable turns of a body of revolution and their products with the flip."""
+    finite = symmetry.rotations()
+    if not symmetry.is_revolution:
+        return finite[1:]
+    turns = pose.rotation_about(symmetry.axis, REVOLUTION_ANGLES)
+    return np.concatenate([turns @ r for r in finite])
+
+
+def describe(symmetry: Symmetry) -> str:
+    """The group in one phrase for people."""
+    axis = "(" + " ".join(f"{round(v, 3) + 0.0:g}" for v in symmetry.axis) + ")"
+    if symmetry.kind == "cyclic":
+        return f"cyclic of order {symmetry.order} about {axis}"
+    if symmetry.kind == "dihedral":
+        return f"dihedral of order {symmetry.order} about {axis}"
+    if symmetry.kind == "revolution":
+        return f"revolution about {axis} {'with' if symmetry.flip else 'without'} flip"
+    return "none" if symmetry.kind == "none" else f"group of {len(symmetry.quaternions)} rotations"
+
+
+class _Detection:
+    """Hypotheses in order of size; the rejected ones are remembered for the runner-up."""
+
+    def __init__(self, check: RotationCheck, covariance: Array) -> None:
+        self.check = check
+        values, vectors = np.linalg.eigh(covariance)
+        self.radii = np.sqrt(np.clip(values, 0, None))  # ascending
+        self.axes = vectors.T
+        self.rejected: list[tuple[float, str]] = []
+
+    def group(self) -> Symmetry:
+        near = np.diff(self.radii) < EQUAL_MOMENTS * self.radii[1:]
+        if near.all():
+            return self._any_direction()
+        if near[0]:
+            return self._single_axis(self.axes[2], self.axes[0])
+        if near[1]:
+            return self._single_axis(self.axes[0], self.axes[2])
+        return self._half_turns()
+
+    def runner_up(self) -> tuple[str, float]:
+        if not self.rejected:
+            return "nothing else was near", float("inf")
+        residual, name = min(self.rejected)
+        return name, residual
+
+    def _accept(self, symmetry: Symmetry) -> bool:
+        """Whether the whole group leaves the surface in place."""
+        rotations = tested_rotations(symmetry)
+        if self.check.holds(rotations):
+            return True
+        if symmetry.order <= 12:  # larger ones turn so little that their residual says nothing
+            self.rejected.append((self.check.worst(rotations), describe(symmetry)))
+        return False
+
+    def _half_turns(self) -> Symmetry:
+        """Three different principal moments: nothing but half turns about the principal axes."""
+        turns = [Symmetry("cyclic", axis_of(u), 2) for u in self.axes[::-1]]
+        accepted = [s for s in turns if self._accept(s)]
+        if len(accepted) >= 2:
+            both = Symmetry("dihedral", accepted[0].axis, 2, flip_axis=accepted[1].axis)
+            if self._accept(both):
+                return both
+        return accepted[0] if accepted else Symmetry()
+
+    def _single_axis(self, axis: Array, other: Array) -> Symmetry:
+        """Two equal principal moments: turns about ``axis``, half turns about axes across it."""
+        revolution = Symmetry("revolution", axis_of(axis))
+        if self._accept(revolution):
+            flipped = Symmetry("revolution", axis_of(axis), flip=True)
+            return flipped if self._accept(flipped) else revolution
+        order = self._order(axis)
+        across = self._across(axis, other, order)
+        if across is None:
+            return Symmetry("cyclic", axis_of(axis), order) if order > 1 else Symmetry()
+        if order == 1:
+            return Symmetry("cyclic", axis_of(across), 2)
+        dihedral = Symmetry("dihedral", axis_of(axis), order, flip_axis=axis_of(across))
+        return dihedral if self._accept(dihedral) else Symmetry("cyclic", axis_of(axis), order)
+
+    def _order(self, axis: Array) -> int:
+        """The largest order of a cyclic group about ``axis``; all its turns are checked, not one."""
+        for order in range(LARGEST_ORDER, 1, -1):
+            near_half = pose.rotation_about(axis, 2 * np.pi / order * (order // 2))
+            if order > 12 and self.check.residual(near_half, self.check.screen) > self.check.tolerance:
+                continue
+            if self._accept(Symmetry("cyclic", axis_of(axis), order)):
+                return order
+        return 1
+
+    def _across(self, axis: Array, other: Array, order: int) -> Array | None:
+        """An axis perpendicular to ``axis`` whose half turn holds; they repeat every half turn / ``order``."""
+        period = np.pi / order
+        count = max(16, int(np.ceil(period / np.radians(1.0))))
+        angles = np.arange(count) * period / count
+        axes = pose.rotation_about(axis, angles) @ other
+        scores = np.array([self.check.mean(pose.rotation_about(u, np.pi)) for u in axes])
+        minima = np.flatnonzero((scores <= np.roll(scores, 1)) & (scores <= np.roll(scores, -1)))
+        for i in minima[np.argsort(scores[minima])][:8]:
+            across = refine_axis(self.check, axes[i], np.pi)
+            if order > 1:  # two axes of one group are perpendicular: take the rounding out
+                across = across - (across @ axis) * axis
+                across /= np.linalg.norm(across)
+            if self._accept(Symmetry("cyclic", axis_of(across), 2)):
+                return across
+        return None
+
+    def _any_direction(self) -> Symmetry:
+        """Three equal principal moments: a regular polyhedron's group, or an accident of proportions."""
+        found = search_axes(self.check)
+        revolutions: list[Array] = []
+        for u, _ in found:
+            is_new = all(abs(u @ v) < np.cos(0.1) for v in revolutions)
+            if is_new and self.check.holds(tested_rotations(Symmetry("revolution", axis_of(u)))):
+                revolutions.append(u)
+        if len(revolutions) > 1:
+            raise ValueError("the part must not be a ball, which looks the same from all sides: it has no orientation")
+        if revolutions:
+            return self._single_axis(
+                revolutions[0], np.asarray(Symmetry("none", axis_of(revolutions[0])).perpendicular)
+            )
+        if not found:
+            return Symmetry()
+        group = closure(np.stack([pose.rotation_about(u, 2 * np.pi / n) for u, n in found]))
+        # A group about one axis has at most half turns across it; a polyhedron's has several axes of order >= 3.
+        many = [u for u, n in found if n > 2]
+        has_one_axis = all(abs(u @ many[0]) > np.cos(0.1) for u in many)
+        if group is not None and not has_one_axis:
+            symmetry = Symmetry("group", quaternions=quaternions_of(group))
+            if self._accept(symmetry):
+                return symmetry
+        axis = max(found, key=lambda item: (item[1], sum(abs(item[0] @ u) < 0.05 for u, _ in found)))[0]
+        return self._single_axis(axis, np.asarray(Symmetry("none", axis_of(axis)).perpendicular))
+
+
+def _tidy(symmetry: Symmetry) -> Symmetry:
+    """Axes within 0.05 degrees of a coordinate axis become that axis."""
+
+    def snapped(axis: Axis) -> Axis:
+        u = np.asarray(axis)
+        unit = np.eye(3)[np.argmax(np.abs(u))]
+        return axis_of(unit) if np.linalg.norm(u - unit) < SNAP_ANGLE else axis
+
+    if symmetry.kind == "group":
+        return symmetry
+    axis, flip_axis = snapped(symmetry.axis), snapped(symmetry.flip_axis)
+    if symmetry.kind == "dihedral":
+        f = np.asarray(flip_axis) - np.dot(flip_axis, axis) * np.asarray(axis)
+        flip_axis = snapped(axis_of(f / np.linalg.norm(f)))
+    return Symmetry(symmetry.kind, axis, symmetry.order, symmetry.flip, flip_axis)
