@@ -225,4 +225,4 @@ def type_problem(default: object, value: object) -> str:
         return "" if number and not isinstance(value, float) else "a whole number"
     if isinstance(default, float):
         return "" if number and math.isfinite(float(value)) else "a finite number"  # type: ignore[arg-type]
-    return "" if isinstance(value, str) or number or isinstance(value, bool) else "a text"
+    return "" if isinstance(value, str) else "a text"

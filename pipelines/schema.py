@@ -14,6 +14,8 @@ from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
+_NOUNS: dict[type, str] = {int: "a whole number ", float: "a number ", str: "a text ", dict: "a section or null "}
+
 
 @dataclass(frozen=True)
 class Range:
@@ -32,7 +34,7 @@ class Range:
     high: float = math.inf
     above: float = -math.inf
     options: tuple[str, ...] = ()
-    kind: type[int] | type[float] | type[str] | type[dict] | None = None
+    kind: type | None = None
 
     def __str__(self) -> str:
         if self.options:
@@ -44,9 +46,7 @@ class Range:
             parts.append(f"at least {self.low:g}")
         if self.high < math.inf:
             parts.append(f"at most {self.high:g}")
-        noun = {int: "a whole number ", float: "a number ", str: "a text ", dict: "a section or null "}.get(
-            self.kind, ""
-        )
+        noun = "" if self.kind is None else _NOUNS[self.kind]
         return noun + " and ".join(parts) if parts else noun.strip() or "a finite number"
 
     def accepts(self, value: object) -> bool:
@@ -109,10 +109,11 @@ RANGES: tuple[Range, ...] = (
     Range("model.*_fraction", above=0, high=10),
     Range("model.center_seed", options=("voxel", "mean")),
     Range("model.rotation", options=("quaternion", "six")),
-    Range("*.confidence", options=("exponential", "quality")),
+    Range("model.confidence", options=("exponential", "quality")),
     Range("model.refinement", kind=dict),
     Range("model.refinement_steps", low=0, high=100),
     Range("model.*", low=1),
+    Range("loss.settings.confidence", options=("exponential", "quality")),
     Range("loss.settings.rotation", options=("metric", "slerp", "minra", "nlerp")),
     Range("loss.settings.least_visible", low=0, high=1),
     Range("trainer.optimizer", options=("adam", "adamw")),
