@@ -70,7 +70,8 @@ RANGES: tuple[Range, ...] = (
     Range("object.diameter", above=0, high=10, kind=float),
     Range("object.base_radius", above=0, high=10, kind=float),
     Range("object.voxel_size", above=0, high=10, kind=float),
-    Range("object.units", options=("m", "cm", "mm", "inch")),
+    Range("tolerance", above=0, high=0.05),
+    Range("*units", options=("m", "cm", "mm", "inch")),
     Range("*splits", options=("train", "val", "test")),
     Range("*split", options=("train", "val", "test")),
     Range("*sensor", options=("none", "gaussian", "phoxi")),
@@ -98,7 +99,6 @@ RANGES: tuple[Range, ...] = (
     Range("data.points", low=3),
     Range("data.normal_neighbors", low=3, high=1000),
     Range("data.augmentation.tilt", low=0, high=3.15),
-    Range("data.workers", low=0, high=1024),  # 0: samples are drawn in the training process
     Range("*workers", low=1, high=1024, kind=int),
     Range("model.centers", low=1),
     Range("model.neighbors", low=1),
