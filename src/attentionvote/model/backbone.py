@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -35,7 +36,7 @@ class SetAbstraction(nn.Module):
         self.project = nn.Linear(width_in, widths[0], bias=False) if width_in else None
         sizes = [CHANNELS, *widths]
         self.weights = nn.ParameterList()
-        for a, b in zip(sizes, sizes[1:], strict=False):
+        for a, b in itertools.pairwise(sizes):
             self.weights += [torch.randn(b, a) * math.sqrt(2.0 / a), torch.zeros(b)]
         self.norm = RowNorm(widths[-1])
         self.residual = Residual(widths[-1]) if residual else nn.Identity()

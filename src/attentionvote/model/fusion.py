@@ -21,7 +21,9 @@ class VoteBranch(nn.Module):
         super().__init__()
         self.project = nn.Linear(width_in, widths[0], bias=False)
         self.offset = nn.Linear(3, widths[0], bias=False)
-        self.rest = nn.Sequential(RowNorm(widths[0]), nn.ReLU(inplace=True), *shared_mlp(widths[0], widths[1:-1], widths[-1]))
+        self.rest = nn.Sequential(
+            RowNorm(widths[0]), nn.ReLU(inplace=True), *shared_mlp(widths[0], widths[1:-1], widths[-1])
+        )
 
     def forward(
         self,

@@ -15,7 +15,12 @@ from attentionvote.model.layers import shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
 from attentionvote.model.proposals import Peaks, gather_votes, heatmap_peaks
 from attentionvote.model.refinement import Refined, Refiner
-from attentionvote.model.rotation import matrix_from_quaternion, matrix_from_six, quaternion_from_matrix, unit_quaternion
+from attentionvote.model.rotation import (
+    matrix_from_quaternion,
+    matrix_from_six,
+    quaternion_from_matrix,
+    unit_quaternion,
+)
 
 
 class Votes(NamedTuple):
@@ -145,7 +150,9 @@ class AttentionVote(nn.Module):
         self.fusion = AttentionVoting(width, fusion)
         self.head = shared_mlp(self.fusion.width, head)
         self.output = nn.Linear(head[-1], 3 + rotation_size + classes + 1)
-        nn.init.normal_(self.vote[-1].weight, std=0.01)
+        last = self.vote[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.normal_(last.weight, std=0.01)
         self.refiner: Refiner | None = None
         self.refined_score: nn.Linear | None = None
         if refinement is not None:
@@ -170,13 +177,13 @@ class AttentionVote(nn.Module):
         """The K hottest peaks of the votes' heatmap (section 3.2); positions carry no gradient to the votes."""
         return heatmap_peaks(votes.xyz.detach(), self.voxel_size, self.proposals, self.peak_window, self.center_seed)
 
-    def regress(self, votes: Votes, peaks: Peaks, rows: Int[Tensor, "rows"] | None = None) -> Poses:
+    def regress(self, votes: Votes, peaks: Peaks, rows: Int[Tensor, " rows"] | None = None) -> Poses:
         """Poses of proposals from the votes around them (sections 3.3, 3.4).
 
         Args:
             rows: flat indices into ``(batch, K)`` of the proposals wanted; all when None.
         """
-        batch, proposals, _ = peaks.center_seed.shape
+        batch, _, _ = peaks.center_seed.shape
         index = gather_votes(votes.xyz.detach(), peaks.center_seed, self.voting_radius, self.gathered)
         first_row = torch.arange(batch, device=index.device)[:, None, None] * votes.xyz.shape[1]
         index = (index + first_row).flatten(0, 1)
@@ -197,7 +204,7 @@ class AttentionVote(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        sample: Int[Tensor, "rows"],
+        sample: Int[Tensor, " rows"],
         poses: Poses,
     ) -> Poses:
         """One correction of the poses with a new score; ``sample`` names each row's sample of the batch."""

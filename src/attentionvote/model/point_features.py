@@ -34,7 +34,9 @@ def pair_features_reference(
     distance = offset.norm(dim=-1, keepdim=True)
     unit = offset / (distance + _TINY)
     center_normal = center_normals[:, None].expand_as(normal)
-    cosines = [(a * b).sum(-1, keepdim=True) for a, b in ((center_normal, unit), (normal, unit), (center_normal, normal))]
+    cosines = [
+        (a * b).sum(-1, keepdim=True) for a, b in ((center_normal, unit), (normal, unit), (center_normal, normal))
+    ]
     return torch.cat([offset / radius, normal, distance / radius, *cosines], dim=-1)
 
 
@@ -52,6 +54,10 @@ def pair_features(
     if library is None:
         return pair_features_reference(points, normals, centers, center_normals, index, radius)
     out = torch.empty(*index.shape, CHANNELS)
-    arrays: list[np.ndarray] = [t.detach().contiguous().numpy() for t in (points, normals, centers, center_normals, index)]
-    native.call(library.pair_features, *arrays, *map(native.long, (0, len(centers))), index.shape[1], radius, out.numpy())
+    arrays: list[np.ndarray] = [
+        t.detach().contiguous().numpy() for t in (points, normals, centers, center_normals, index)
+    ]
+    native.call(
+        library.pair_features, *arrays, *map(native.long, (0, len(centers))), index.shape[1], radius, out.numpy()
+    )
     return out

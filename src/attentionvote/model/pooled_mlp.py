@@ -79,9 +79,7 @@ class _PooledMLP(torch.autograd.Function):
         assert library is not None
         _in_threads(
             centers,
-            lambda _, a, b: native.call(
-                library.pooled_forward, *arguments(a, b), out.numpy(), winner.numpy()
-            ),
+            lambda _, a, b: native.call(library.pooled_forward, *arguments(a, b), out.numpy(), winner.numpy()),
         )
         ctx.save_for_backward(geometry, projected, index, winner, *weights)
         return out

@@ -11,6 +11,7 @@ paper's form.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ class Refined(NamedTuple):
 def points_in_box_reference(
     points: Float[Tensor, "batch points 3"],
     normals: Float[Tensor, "batch points 3"],
-    sample: Int[Tensor, "rows"],
+    sample: Int[Tensor, " rows"],
     center: Float[Tensor, "rows 3"],
     rotation: Float[Tensor, "rows 3 3"],
     box: Float[Tensor, "2 3"],
@@ -69,7 +70,7 @@ def points_in_box_reference(
 def points_in_box(
     points: Float[Tensor, "batch points 3"],
     normals: Float[Tensor, "batch points 3"],
-    sample: Int[Tensor, "rows"],
+    sample: Int[Tensor, " rows"],
     center: Float[Tensor, "rows 3"],
     rotation: Float[Tensor, "rows 3 3"],
     box: Float[Tensor, "2 3"],
@@ -85,8 +86,9 @@ def points_in_box(
     found = np.empty(len(center), dtype=np.int32)
     p, m, s, c, r, b = (t.detach().contiguous().numpy() for t in (points, normals, sample, center, rotation, box))
     rows = map(native.long, (0, len(center)))
+    corners = b[0], b[1]
     native.call(
-        library.points_in_box, p, m, points.shape[1], s, c, r, *rows, b[0], b[1], float(scale), count, out.numpy(), found
+        library.points_in_box, p, m, points.shape[1], s, c, r, *rows, *corners, float(scale), count, out.numpy(), found
     )
     return out
 
@@ -116,10 +118,11 @@ class Refiner(nn.Module):
         self.diameter, self.points = diameter, points
         margin = 0.06 * diameter
         corners = torch.tensor(box, dtype=torch.float32) + torch.tensor([[-margin], [margin]])
+        self.box: Tensor
         self.register_buffer("box", corners)
         sizes = [CHANNELS, *widths]
         self.weights = nn.ParameterList()
-        for a, b in zip(sizes, sizes[1:], strict=False):
+        for a, b in itertools.pairwise(sizes):
             self.weights += [torch.randn(b, a) * (2.0 / a) ** 0.5, torch.zeros(b)]
         self.norm = RowNorm(widths[-1])
         self.mlp = shared_mlp(widths[-1] + context, head)
@@ -132,15 +135,14 @@ class Refiner(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        sample: Int[Tensor, "rows"],
+        sample: Int[Tensor, " rows"],
         center: Float[Tensor, "rows 3"],
         rotation: Float[Tensor, "rows 3 3"],
         context: Float[Tensor, "rows channels"],
     ) -> Refined:
         """One correction; the given pose is taken as a measurement and gets no gradient."""
         center, rotation = center.detach(), rotation.detach()
-        box: Tensor = self.box
-        seen = points_in_box(points, normals, sample, center, rotation, box, 2.0 / self.diameter, self.points)
+        seen = points_in_box(points, normals, sample, center, rotation, self.box, 2.0 / self.diameter, self.points)
         nobody = torch.zeros(seen.shape[:2], dtype=torch.long, device=seen.device)
         pooled = torch.relu(self.norm(pooled_mlp(seen, None, nobody, list(self.weights))))
         feature = self.mlp(torch.cat([pooled, context], dim=-1))

@@ -27,9 +27,9 @@ class Assignment(NamedTuple):
         positive: ``(rows,)`` whether it is near enough to be supervised.
     """
 
-    sample: Int[Tensor, "rows"]
-    instance: Int[Tensor, "rows"]
-    positive: Bool[Tensor, "rows"]
+    sample: Int[Tensor, " rows"]
+    instance: Int[Tensor, " rows"]
+    positive: Bool[Tensor, " rows"]
 
 
 @dataclass(frozen=True)
@@ -95,12 +95,15 @@ class AttentionVoteLoss:
         terms = {"vote": masked_mean(error, on_part)}
         if votes.rotation is not None:
             turn = self.training_pose.rotation_loss(
-                "metric", votes.rotation.new_zeros(0, 4), votes.rotation.flatten(0, 1), batch.rotation[rows, index].flatten(0, 1)
+                "metric",
+                votes.rotation.new_zeros(0, 4),
+                votes.rotation.flatten(0, 1),
+                batch.rotation[rows, index].flatten(0, 1),
             )
             terms["vote_rotation"] = masked_mean(turn.view_as(error), on_part)
         return terms
 
-    def assign(self, peaks: Peaks, batch: Batch, rows: Int[Tensor, "rows"]) -> Assignment:
+    def assign(self, peaks: Peaks, batch: Batch, rows: Int[Tensor, " rows"]) -> Assignment:
         """The nearest visible instance of every proposal (paper, "Assigning instance labels")."""
         sample = rows // peaks.heat.shape[1]
         seed = peaks.center_seed.flatten(0, 1)[rows]
@@ -143,7 +146,7 @@ class AttentionVoteLoss:
         loss = torch.nn.functional.binary_cross_entropy_with_logits(poses.score, quality, reduction="none")
         return {"confidence": loss.mean() if len(loss) else poses.score.sum()}
 
-    def quality(self, poses: Poses, assigned: Assignment, batch: Batch) -> Float[Tensor, "rows"]:
+    def quality(self, poses: Poses, assigned: Assignment, batch: Batch) -> Float[Tensor, " rows"]:
         """Share of the thresholds 2, 5, 10 % D that each pose meets, 0 for all but the best on an instance."""
         distance = self.true_pose.distance(poses.center, poses.rotation, *self._truth(assigned, batch))
         distance = distance.masked_fill(~assigned.positive, torch.inf)

@@ -15,9 +15,7 @@ THRESHOLDS = tuple(np.round(np.linspace(0.0, 0.9, 37), 3))
 def confident(scenes: Sequence[SceneResult], threshold: float) -> list[SceneResult]:
     """The same scenes with only the detections of at least this confidence."""
     kept = [scene.scores >= threshold for scene in scenes]
-    return [
-        SceneResult(s.poses[k], s.scores[k], s.gt_poses, s.gt_occlusion) for s, k in zip(scenes, kept, strict=True)
-    ]
+    return [SceneResult(s.poses[k], s.scores[k], s.gt_poses, s.gt_occlusion) for s, k in zip(scenes, kept, strict=True)]
 
 
 def best_threshold(scenes: Sequence[SceneResult], part: Part, fraction: float = 0.1) -> float:

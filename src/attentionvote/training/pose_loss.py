@@ -60,7 +60,7 @@ class SymmetricPose:
 
     def squared_turn(
         self, predicted: Float[Tensor, "rows 3 3"], true: Float[Tensor, "rows 3 3"]
-    ) -> Float[Tensor, "rows"]:
+    ) -> Float[Tensor, " rows"]:
         """Square of the rotational distance in square metres, minimum over the symmetry group."""
         aims = true[:, None] @ (self.group @ self.representation)
         return (predicted[:, None] @ self.representation - aims).square().sum((-2, -1)).amin(1)
@@ -71,7 +71,7 @@ class SymmetricPose:
         rotation: Float[Tensor, "rows 3 3"],
         true_center: Float[Tensor, "rows 3"],
         true_rotation: Float[Tensor, "rows 3 3"],
-    ) -> Float[Tensor, "rows"]:
+    ) -> Float[Tensor, " rows"]:
         """The pose distance of the evaluation in metres (with ``isotropic`` 0)."""
         return (self.squared_turn(rotation, true_rotation) + (center - true_center).square().sum(-1)).sqrt()
 
@@ -81,7 +81,7 @@ class SymmetricPose:
         quaternion: Float[Tensor, "rows 4"],
         rotation: Float[Tensor, "rows 3 3"],
         true: Float[Tensor, "rows 3 3"],
-    ) -> Float[Tensor, "rows"]:
+    ) -> Float[Tensor, " rows"]:
         """Rotation loss of each row: ``metric`` in units of 0.1 D, the quaternion forms in radians.
 
         Raises:
