@@ -99,10 +99,10 @@ def configuration_text(part: Part, finding: SymmetryFinding, mesh: Path, source:
             f"{finding.residual * 1e3:.4f} mm ({finding.residual / d:.4%} of D) of itself"
         )
     rejected = "nothing else was near"
-    if finding.runner_up_residual < 1e9:
+    if (away := finding.runner_up_residual) < 1e9:
         rejected = (
             f"the best hypothesis rejected is\n# {finding.runner_up} (axis in the file's frame), "
-            f"which leaves it {finding.runner_up_residual * 1e3:.3f} mm ({finding.runner_up_residual / d:.2%} of D) away or more"
+            f"which leaves it {away * 1e3:.3f} mm ({away / d:.2%} of D) away or more"
         )
     symmetry = "\n".join(f"  {key}: {json.dumps(value)}" for key, value in _symmetry_settings(part).items())
     return f"""# {part.name}: made by `make part` from {source}.

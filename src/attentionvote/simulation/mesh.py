@@ -121,4 +121,4 @@ def _check_solid(mesh: trimesh.Trimesh, name: str) -> None:
 def write_surface(vertices: NDArray[np.float64], faces: NDArray[np.int64], path: Path) -> None:
     """Write a PLY file in metres; 32-bit numbers, that is, to 10 nm on a part of the size of a hand."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    path.write_bytes(mesh.export(file_type="ply"))
+    mesh.export(path, file_type="ply")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
 from attentionvote.part import Part
@@ -35,17 +35,21 @@ def write_picture(part: Part, path: Path) -> None:
         _draw_frame(axes, part)
         middle, half = (part.vertices.min(0) + part.vertices.max(0)) * 500, part.diameter * 550
         axes.set(**{f"{k}lim": (m - half, m + half) for k, m in zip("xyz", middle, strict=True)})
-        axes.set(xlabel="x mm", ylabel="y mm", zlabel="z mm", title=name)
-        axes.set_box_aspect((1, 1, 1), zoom=1.1)
+        axes.set_title(name)
+        axes.set_axis_off()
+        axes.set_box_aspect((1, 1, 1), zoom=1.3)
         axes.view_init(elevation, azimuth)
-    figure.suptitle(f"{part.title or part.name}: D {part.diameter * 1000:.2f} mm, symmetry {describe(part.symmetry)}")
+    size = " x ".join(f"{e * 1000:.1f}" for e in part.vertices.max(0) - part.vertices.min(0))
+    symmetry = describe(part.symmetry)
+    figure.suptitle(f"{part.title or part.name}: {size} mm, D {part.diameter * 1000:.2f} mm, symmetry {symmetry}")
     figure.savefig(path, dpi=100, format="png")
 
 
-def _draw_frame(axes: Axes, part: Part) -> None:
+def _draw_frame(axes: Axes3D, part: Part) -> None:
     reach = part.diameter * 0.6 * 1000
-    for unit, colour in zip(np.eye(3), ("tab:red", "tab:green", "tab:blue"), strict=True):
+    for unit, colour, name in zip(np.eye(3), ("tab:red", "tab:green", "tab:blue"), "xyz", strict=True):
         axes.plot(*np.stack([np.zeros(3), unit * reach]).T, color=colour, linewidth=2)
+        axes.text(*(unit * reach * 1.05), name, color=colour)
     if part.symmetry.kind in ("cyclic", "dihedral", "revolution"):
         u = np.asarray(part.symmetry.axis) * reach * 1.15
         axes.plot(*np.stack([-u, u]).T, color="black", linestyle="--", linewidth=1.5)

@@ -80,7 +80,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
     moved = not np.array_equal(part_from_file, np.eye(4))
     # The last word: the symmetry exactly as it will be written, about the origin that it will be written for.
     fixed_point = centroid if moved else nearest_fixed_point(symmetry, centroid)
-    final = RotationCheck(vertices - fixed_point, faces, tolerance * diameter, exact=0.01)
+    final = RotationCheck(vertices - fixed_point, faces, tolerance * diameter, exact=0.1)
     residual = max((final.residual(r) for r in tested_rotations(symmetry)), default=0.0)
     runner_up, runner_up_residual = detection.runner_up()
     return SymmetryFinding(
@@ -97,7 +97,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
 def symmetry_residual(vertices: Array, faces: NDArray[np.int64], symmetry: Symmetry) -> float:
     """Largest distance in metres between the surface and its images under ``symmetry`` (about the origin)."""
     tolerance = TOLERANCE * largest_vertex_distance(vertices)
-    check = RotationCheck(np.asarray(vertices, dtype=np.float64), faces, tolerance, exact=0.01)
+    check = RotationCheck(np.asarray(vertices, dtype=np.float64), faces, tolerance, exact=0.1)
     return max((check.residual(r) for r in tested_rotations(symmetry)), default=0.0)
 
 
@@ -187,7 +187,7 @@ class _Detection:
         """The largest order of a cyclic group about ``axis``; all its turns are checked, not one."""
         for order in range(LARGEST_ORDER, 1, -1):
             near_half = pose.rotation_about(axis, 2 * np.pi / order * (order // 2))
-            if order > 12 and self.check.residual(near_half, self.check.screen) > self.check.tolerance:
+            if order > 12 and self.check.residual(near_half, self.check.screen[::15]) > self.check.tolerance:
                 continue
             if self._accept(Symmetry("cyclic", axis_of(axis), order)):
                 return order
