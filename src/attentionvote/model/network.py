@@ -102,7 +102,7 @@ class AttentionVote(nn.Module):
         rotation: ``quaternion`` (the paper's) or ``six`` (Gram-Schmidt of two vectors).
         confidence: ``exponential`` (c = exp(s), Eq. 10) or ``quality`` (c = sigmoid(s), the expected quality).
         refinement: arguments of ``Refiner`` (points, widths, head), None for the paper's form.
-        refinement_steps: corrections made at inference.
+        refinement_steps: refiners in a row.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class AttentionVote(nn.Module):
         self.layout = Layout(tuple(centers), tuple(neighbors), tuple(radius * k for k in (1, 2, 3, 6)))
         self.proposals, self.gathered, self.classes = proposals, gathered, classes
         self.peak_window, self.center_seed = peak_window, center_seed
-        self.rotation, self.confidence, self.refinement_steps = rotation, confidence, refinement_steps
+        self.rotation, self.confidence = rotation, confidence
         self.backbone = Backbone(self.layout, widths, propagation, residual)
         width = self.backbone.width
         self.vote = shared_mlp(width, voting, 3 + width)
@@ -153,11 +153,9 @@ class AttentionVote(nn.Module):
         last = self.vote[-1]
         assert isinstance(last, nn.Linear)
         nn.init.normal_(last.weight, std=0.01)
-        self.refiner: Refiner | None = None
-        self.refined_score: nn.Linear | None = None
-        if refinement is not None:
-            self.refiner = Refiner(diameter, box, context=head[-1], **refinement)
-            self.refined_score = nn.Linear(self.refiner.width, 1)
+        steps = 0 if refinement is None else refinement_steps
+        # A cascade: what is left to correct after one step is another, finer problem than before it.
+        self.refiners = nn.ModuleList(Refiner(diameter, box, context=head[-1], **(refinement or {})) for _ in range(steps))
 
     def cast_votes(
         self,
@@ -204,16 +202,17 @@ class AttentionVote(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        sample: Int[Tensor, " rows"],
+        sample: Int[Tensor, "rows"],
         poses: Poses,
-    ) -> Poses:
-        """One correction of the poses with a new score; ``sample`` names each row's sample of the batch."""
-        if self.refiner is None or self.refined_score is None:
-            return poses
-        better: Refined = self.refiner(points, normals, sample, poses.center, poses.rotation, poses.feature)
-        score = self.refined_score(better.feature)[:, 0]
-        quaternion = quaternion_from_matrix(better.rotation)
-        return Poses(better.center, better.rotation, quaternion, poses.class_logits, score, poses.feature)
+    ) -> list[Poses]:
+        """The poses after every step of the refinement, each with its own score; ``sample`` names each row's sample."""
+        steps = []
+        for refiner in self.refiners:
+            better: Refined = refiner(points, normals, sample, poses.center, poses.rotation, poses.feature)
+            quaternion = quaternion_from_matrix(better.rotation)
+            poses = Poses(better.center, better.rotation, quaternion, poses.class_logits, better.score, poses.feature)
+            steps.append(poses)
+        return steps
 
     def forward(
         self,
@@ -235,8 +234,8 @@ class AttentionVote(nn.Module):
         poses = self.regress(votes, peaks)
         batch, k = peaks.heat.shape
         sample = torch.arange(batch, device=points.device).repeat_interleave(k)
-        for _ in range(self.refinement_steps if self.refiner is not None else 0):
-            poses = self.refine(points, normals, sample, poses)
+        if len(self.refiners):
+            poses = self.refine(points, normals, sample, poses)[-1]
 
         def shaped(rows: Tensor) -> Tensor:
             return rows.view(batch, k, *rows.shape[1:])

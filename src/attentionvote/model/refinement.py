@@ -29,11 +29,11 @@ CHANNELS = 6
 
 
 class Refined(NamedTuple):
-    """Corrected poses: centre ``(rows, 3)``, rotation ``(rows, 3, 3)``, and ``feature`` ``(rows, width)``."""
+    """Corrected poses: centre ``(rows, 3)``, rotation ``(rows, 3, 3)``, and their score ``(rows,)``."""
 
     center: Tensor
     rotation: Tensor
-    feature: Tensor
+    score: Tensor
 
 
 def points_in_box_reference(
@@ -101,7 +101,7 @@ class Refiner(nn.Module):
         box: lowest and highest corner of the part in its own frame, metres.
         points: points looked at per proposal.
         widths: shared MLP over the points; its maximum is the description of what is left to correct.
-        head: MLP after the maximum; its last width is the width of the returned feature.
+        head: MLP after the maximum.
         context: channels of the proposal's own feature, appended to the maximum.
     """
 
@@ -126,10 +126,9 @@ class Refiner(nn.Module):
             self.weights += [torch.randn(b, a) * (2.0 / a) ** 0.5, torch.zeros(b)]
         self.norm = RowNorm(widths[-1])
         self.mlp = shared_mlp(widths[-1] + context, head)
-        self.change = nn.Linear(head[-1], 9)
-        nn.init.normal_(self.change.weight, std=1e-3)
-        nn.init.zeros_(self.change.bias)
-        self.width = head[-1]
+        self.output = nn.Linear(head[-1], 10)
+        nn.init.normal_(self.output.weight, std=1e-3)
+        nn.init.zeros_(self.output.bias)
 
     def forward(
         self,
@@ -145,9 +144,8 @@ class Refiner(nn.Module):
         seen = points_in_box(points, normals, sample, center, rotation, self.box, 2.0 / self.diameter, self.points)
         nobody = torch.zeros(seen.shape[:2], dtype=torch.long, device=seen.device)
         pooled = torch.relu(self.norm(pooled_mlp(seen, None, nobody, list(self.weights))))
-        feature = self.mlp(torch.cat([pooled, context], dim=-1))
-        change = self.change(feature)
-        identity = torch.tensor([1.0, 0, 0, 0, 1.0, 0], device=change.device)
-        shift = (rotation @ change[:, :3, None])[..., 0] * (0.1 * self.diameter)
-        turn = matrix_from_six(identity + 0.3 * change[:, 3:])
-        return Refined(center + shift, rotation @ turn, feature)
+        out = self.output(self.mlp(torch.cat([pooled, context], dim=-1)))
+        identity = torch.tensor([1.0, 0, 0, 0, 1.0, 0], device=out.device)
+        shift = (rotation @ out[:, :3, None])[..., 0] * (0.1 * self.diameter)
+        turn = matrix_from_six(identity + 0.3 * out[:, 3:9])
+        return Refined(center + shift, rotation @ turn, out[:, 9])

@@ -64,7 +64,7 @@ class AttentionVoteLoss:
         part: diameter and symmetry.
         weights: weight of each term: ``vote`` (Eq. 1), ``vote_rotation`` (dense supervision: every vote's own
             rotation), ``center``, ``rotation``, ``semantic`` (Eq. 9), ``confidence`` (Eq. 10), ``refined`` (pose
-            after the refinement). A weight of 0 leaves a term out.
+            after the refinement, mean over its steps). A weight of 0 leaves a term out.
         settings: the choices.
     """
 
@@ -132,12 +132,12 @@ class AttentionVoteLoss:
             terms["confidence"] = masked_mean(instance * score.exp() - score, assigned.positive)
         return terms
 
-    def refined_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
-        """Distance after the refinement: centre and rotation together, as the evaluation measures it."""
+    def refined_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> Tensor:
+        """Distance after a step of the refinement: centre and rotation together, as the evaluation measures it."""
         center, rotation = self._truth(assigned, batch)
         turn = self.training_pose.squared_turn(poses.rotation, rotation)
         squared = turn + (poses.center - center).square().sum(-1)
-        return {"refined": masked_mean((squared + 1e-10).sqrt() / self.unit, assigned.positive)}
+        return masked_mean((squared + 1e-10).sqrt() / self.unit, assigned.positive)
 
     def quality_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
         """Cross entropy between the predicted and the measured quality of every proposal."""
@@ -183,9 +183,10 @@ def batch_loss(
     assigned = loss.assign(peaks, batch, rows)
     terms |= loss.proposal_terms(poses, assigned, batch)
     final = poses
-    if model.refiner is not None:
-        final = model.refine(batch.points, batch.normals, assigned.sample, poses)
-        terms |= loss.refined_term(final, assigned, batch)
+    steps = model.refine(batch.points, batch.normals, assigned.sample, poses)
+    if steps:
+        final = steps[-1]
+        terms["refined"] = torch.stack([loss.refined_term(step, assigned, batch) for step in steps]).mean()
     if loss.settings.confidence == "quality":
         terms |= loss.quality_term(final, assigned, batch)
     return terms
