@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply
 from attentionvote.part import Part
@@ -113,6 +114,16 @@ def test_the_bin_scales_with_the_part_and_varies() -> None:
     np.testing.assert_allclose(BinSettings((0.4, 0.3, 0.2), 0).sample(0.1, np.random.default_rng(0)), (0.4, 0.3, 0.2))
 
 
+def test_the_bin_grows_for_bulky_parts_only(bracket: Part) -> None:
+    assert BinSettings().scaling_diameter(bracket, 3) == bracket.diameter
+    diameter = BinSettings().scaling_diameter(bracket, 150)
+    assert diameter > bracket.diameter
+    volume = np.prod(BinSettings(jitter=0).sample(diameter, np.random.default_rng(0)))
+    assert 150 * ConvexHull(bracket.vertices).volume == pytest.approx(0.45 * volume)
+    # A given size rules, also over the camera's distance.
+    assert BinSettings((0.72, 0.3, 0.2)).scaling_diameter(bracket, 150) == pytest.approx(2 * 0.143)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -136,7 +147,7 @@ def test_true_surfaces_neither_penetrate_nor_hover(name: str, slow: SimpleNamesp
     """Measured on the true meshes, not on the physics engine's own contacts."""
     part = load_part(name, f"builtin:{name}")
     hulls, rng = convex_hulls(part, cache=tmp_path), np.random.default_rng(0)
-    size = BinSettings().sample(part.diameter, rng)
+    size = BinSettings().sample(BinSettings().scaling_diameter(part, 30), rng)
     poses = list(drop_parts(part, hulls, 12, size, 0.4, DropSettings(), rng))[-1].bin_from_part
     assert len(poses) == 12
     triangles = part.vertices[part.faces]
