@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,6 +38,7 @@ def test_import_directions_are_kept() -> None:
 def test_the_cells_share_imports_without_the_training_stack() -> None:
     program = f"""
 import sys
+import tomllib
 class Blocked:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in {TRAINING_STACK!r}:
@@ -163,3 +165,11 @@ def test_constraints_are_exact_and_carry_no_address() -> None:
         assert version, line
         assert not set("@/+; ") & set(line), line
     assert "torch==2.13.0" in lines
+
+
+def test_every_c_file_is_packaged() -> None:
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    patterns = patterns["tool"]["setuptools"]["package-data"]["attentionvote"]
+    package = ROOT / "src" / "attentionvote"
+    packaged = {path for pattern in patterns for path in package.glob(pattern)}
+    assert set(package.rglob("*.c")) <= packaged
