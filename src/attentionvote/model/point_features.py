@@ -55,9 +55,9 @@ def pair_features(
         return pair_features_reference(points, normals, centers, center_normals, index, radius)
     out = torch.empty(*index.shape, CHANNELS)
     arrays: list[np.ndarray] = [
-        t.detach().contiguous().numpy() for t in (points, normals, centers, center_normals, index)
+        t.detach().contiguous().numpy() for t in (points, normals, centers, center_normals, index.long())
     ]
     native.call(
-        library.pair_features, *arrays, *map(native.long, (0, len(centers))), index.shape[1], radius, out.numpy()
+        library.pair_features, *arrays, *map(native.long, (0, len(centers))), index.shape[1], float(radius), out.numpy()
     )
     return out

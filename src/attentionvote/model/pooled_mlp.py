@@ -21,6 +21,7 @@ from torch import Tensor
 from attentionvote.geometry import native
 
 MOST_NEIGHBORS = 256  # the winner of a maximum is kept in a byte
+MOST_LAYERS = 9  # as many as the kernel has pointers for
 
 
 def pooled_mlp_reference(
@@ -54,15 +55,19 @@ def pooled_mlp(
 ) -> Float[Tensor, "centers out"]:
     """``pooled_mlp_reference`` by the fastest means at hand; ``geometry`` gets no gradient.
 
-    The C kernel serves float32 on a CPU with widths that are multiples of 8; everything else, and tracing for
-    export, takes the reference.
+    The C kernel serves float32 on a CPU with two to nine layers and widths that are multiples of 8; everything else,
+    and tracing for export, takes the reference.
     """
-    fits = geometry.shape[1] < MOST_NEIGHBORS and all(b.shape[0] % 8 == 0 for b in weights[1::2]) and len(weights) > 2
-    plain = geometry.device.type == "cpu" and geometry.dtype == torch.float32 and not torch.compiler.is_compiling()
+    fits = geometry.shape[1] < MOST_NEIGHBORS and all(b.shape[0] % 8 == 0 for b in weights[1::2])
+    fits = fits and 2 <= len(weights) // 2 <= MOST_LAYERS
+    inputs = [geometry, *weights] if projected is None else [geometry, projected, *weights]
+    # The kernel reads raw memory: under autocast only the projection would be of half precision.
+    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs)
+    plain = plain and not torch.compiler.is_compiling()
     library = native.load("attentionvote.model", "network_ops.c", tuned=True) if fits and plain else None
     if library is None:
         return pooled_mlp_reference(geometry, projected, index, weights)
-    result: Tensor = _PooledMLP.apply(geometry.detach(), projected, index, *weights)
+    result: Tensor = _PooledMLP.apply(geometry.detach(), projected, index.long(), *weights)
     return result
 
 
@@ -95,7 +100,7 @@ class _PooledMLP(torch.autograd.Function):
         partial: list[tuple[list[Tensor], Tensor | None]] = []
         for _ in range(_thread_count(len(geometry))):
             # Narrow inputs: the first layer's gradient is gathered as (in, out) rows.
-            sums = [torch.zeros_like(w) if i else torch.zeros(w.T.shape) for i, w in enumerate(weights)]
+            sums = [torch.zeros(w.shape if i else w.T.shape) for i, w in enumerate(weights)]
             partial.append((sums, None if projected is None else torch.zeros_like(projected)))
 
         def run(thread: int, a: int, b: int) -> None:

@@ -84,7 +84,9 @@ def points_in_box(
         return points_in_box_reference(points, normals, sample, center, rotation, box, scale, count)
     out = torch.empty(len(center), count, CHANNELS)
     found = np.empty(len(center), dtype=np.int32)
-    p, m, s, c, r, b = (t.detach().contiguous().numpy() for t in (points, normals, sample, center, rotation, box))
+    p, m, s, c, r, b = (
+        t.detach().contiguous().numpy() for t in (points, normals, sample.long(), center, rotation, box)
+    )
     rows = map(native.long, (0, len(center)))
     corners = b[0], b[1]
     native.call(
