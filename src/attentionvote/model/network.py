@@ -103,6 +103,9 @@ class AttentionVote(nn.Module):
         confidence: ``exponential`` (c = exp(s), Eq. 10) or ``quality`` (c = sigmoid(s), the expected quality).
         refinement: arguments of ``Refiner`` (points, widths, head), None for the paper's form.
         refinement_steps: refiners in a row.
+
+    Raises:
+        ValueError: on an unknown ``center_seed``, ``rotation`` or ``confidence``, or an impossible layout.
     """
 
     def __init__(
@@ -134,6 +137,13 @@ class AttentionVote(nn.Module):
         refinement_steps: int = 2,
     ) -> None:
         super().__init__()
+        for name, value, choices in (
+            ("center_seed", center_seed, ("voxel", "mean")),
+            ("rotation", rotation, ("quaternion", "six")),
+            ("confidence", confidence, ("exponential", "quality")),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name} must be {' or '.join(choices)}, got {value!r}")
         self.diameter = diameter
         radius = base_radius or radius_fraction * diameter
         self.voxel_size = voxel_size or voxel_fraction * diameter
@@ -155,7 +165,9 @@ class AttentionVote(nn.Module):
         nn.init.normal_(last.weight, std=0.01)
         steps = 0 if refinement is None else refinement_steps
         # A cascade: what is left to correct after one step is another, finer problem than before it.
-        self.refiners = nn.ModuleList(Refiner(diameter, box, context=head[-1], **(refinement or {})) for _ in range(steps))
+        self.refiners = nn.ModuleList(
+            Refiner(diameter, box, context=head[-1], **(refinement or {})) for _ in range(steps)
+        )
 
     def cast_votes(
         self,
@@ -202,7 +214,7 @@ class AttentionVote(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        sample: Int[Tensor, "rows"],
+        sample: Int[Tensor, " rows"],
         poses: Poses,
     ) -> list[Poses]:
         """The poses after every step of the refinement, each with its own score; ``sample`` names each row's sample."""
