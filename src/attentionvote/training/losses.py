@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -40,7 +40,7 @@ class LossSettings:
         rotation: see ``pose_loss``.
         isotropic: share of D added to Lambda in the ``metric`` rotation loss.
         assignment: a proposal is positive when its centre seed lies within this share of D of an instance.
-        least_visible: instances with less visible fraction are never assigned.
+        least_visible: instances with less visible fraction, and invisible ones, are never assigned.
         confidence: ``exponential`` (Eq. 10) or ``quality``: expected share of the thresholds 2, 5 and 10 % D that
             the pose meets, learned as a probability; proposals that match nothing and all but the best of several on
             one instance count as 0.
@@ -53,6 +53,12 @@ class LossSettings:
     least_visible: float = 0.05
     confidence: Literal["exponential", "quality"] = "quality"
     detach_confidence: bool = True
+
+    def __post_init__(self) -> None:
+        if self.rotation not in get_args(RotationLoss):
+            raise ValueError(f"rotation loss must be one of {', '.join(get_args(RotationLoss))}, got {self.rotation!r}")
+        if self.confidence not in ("exponential", "quality"):
+            raise ValueError(f"confidence loss must be exponential or quality, got {self.confidence!r}")
 
 
 class AttentionVoteLoss:
@@ -108,7 +114,9 @@ class AttentionVoteLoss:
         sample = rows // peaks.heat.shape[1]
         seed = peaks.center_seed.flatten(0, 1)[rows]
         distance = (seed[:, None] - batch.center[sample]).norm(dim=-1)
-        distance = distance.masked_fill(batch.visible[sample] < self.settings.least_visible, torch.inf)
+        visible = batch.visible[sample]
+        # Padding has visibility 0 and lies at the origin.
+        distance = distance.masked_fill((visible <= 0) | (visible < self.settings.least_visible), torch.inf)
         nearest, instance = distance.min(dim=1)
         return Assignment(sample, instance, nearest < self.settings.assignment * 10 * self.unit)
 
