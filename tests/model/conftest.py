@@ -1,0 +1,87 @@
+"""Fixtures of the network tests: the C library, clouds, a small network with random weights."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from attentionvote.geometry import native
+from attentionvote.model import AttentionVote
+
+SMALL: dict[str, Any] = {
+    "diameter": 0.1,
+    "box": [[-0.03, -0.03, -0.05], [0.03, 0.03, 0.05]],
+    "centers": [48, 24, 12, 6],
+    "neighbors": [8, 8, 4, 4],
+    "widths": [[8, 16], [16, 16], [16, 16], [16, 16]],
+    "propagation": [16, 16],
+    "residual": True,
+    "radius_fraction": 0.2,
+    "voxel_fraction": 0.15625,
+    "voting": [16],
+    "vote_rotation": True,
+    "proposals": 4,
+    "peak_window": 2,
+    "center_seed": "mean",
+    "gathered": 4,
+    "fusion": [16, 16],
+    "head": [16],
+    "rotation": "six",
+    "confidence": "quality",
+    "refinement": {"points": 16, "widths": [8, 16], "head": [16]},
+}
+
+
+@pytest.fixture(scope="session")
+def kernels() -> ctypes.CDLL:
+    """The compiled kernels; without them the tests would compare the references with themselves."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler on this machine")
+    library = native.load("attentionvote.model", "network_ops.c", tuned=True)
+    assert library is not None
+    return library
+
+
+def small_network(seed: int = 0, **changes: Any) -> AttentionVote:
+    """A few thousand random weights, in evaluation with norms that are not the identity."""
+    torch.manual_seed(seed)
+    model = AttentionVote(**(SMALL | changes))
+    for module in model.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, std=0.2)
+            torch.nn.init.normal_(module.running_mean, std=0.2)
+            torch.nn.init.uniform_(module.running_var, 0.5, 2.0)
+    return model.eval()
+
+
+def random_cloud(seed: int, samples: int = 1, count: int = 96) -> tuple[Tensor, Tensor]:
+    """Points ``(samples, count, 3)`` of a decimetre cube half a metre away and unit normals, on a 2^-12 m lattice."""
+    rng = np.random.default_rng(seed)
+    points = rng.integers(-205, 205, (samples, count, 3)) * 2.0**-12 + np.array([0, 0, 0.5])
+    normals = rng.normal(size=(samples, count, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(normals.astype(np.float32))
+
+
+# Functions as fixtures of the session: test modules cannot import each other, and hypothesis wants no other scope.
+@pytest.fixture(scope="session")
+def make_network() -> Callable[..., AttentionVote]:
+    return small_network
+
+
+@pytest.fixture(scope="session")
+def small_arguments() -> dict[str, Any]:
+    return SMALL
+
+
+@pytest.fixture(scope="session")
+def make_cloud() -> Callable[..., tuple[Tensor, Tensor]]:
+    return random_cloud
