@@ -20,19 +20,23 @@ log = logging.getLogger("attentionvote.train")
 
 
 def run(cfg: DictConfig) -> dict[str, Any]:
-    """Generate, train, test; the test figures and where the checkpoint is."""
-    from training_run import TrainingRun, build_part, find_training
+    """Generate, train, test; the test figures and where the model is."""
+    from training_job import find_training
 
     with configuring(f"object {cfg.object.name}"):
-        part = build_part(cfg)
-    with configuring():
-        job = find_training(cfg, part)
-    if job.result is not None and not cfg.force:
-        log.info("this training is complete (force=true repeats it): %s", job.directory)
-        return job.result
-    with configuring():
-        training = TrainingRun(cfg, part, job)
-    return training.run()
+        job = find_training(cfg)
+    with job.locked():
+        result = job.result
+        if result is not None and cfg.resume != "never" and not cfg.force:
+            log.info("this training is complete (force=true repeats it): %s", job.directory)
+            return result
+        from training_run import TrainingRun
+
+        with configuring():
+            training = TrainingRun(cfg, job)
+        if cfg.resume == "never" or (cfg.force and result is not None):
+            job.forget()
+        return training.run()
 
 
 def preset_of_hardware(words: list[str]) -> list[str]:
@@ -41,7 +45,7 @@ def preset_of_hardware(words: list[str]) -> list[str]:
         return []
     gpu = Path("/proc/driver/nvidia/version").exists()
     preset, reason = ("gpu", "an NVIDIA driver was found") if gpu else ("compact", "no GPU was found")
-    log.info("experiment=%s (%s; experiment=... chooses another)", preset, reason)
+    log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
     return [f"experiment={preset}"]
 
 

@@ -7,12 +7,10 @@ normals estimated on the whole (denser) cloud. A sample of an epoch is a random 
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
-import multiprocessing
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor, 
 
 _VERSION = 1
 _SCENES_PER_TASK = 4
+_SCENES_PER_PROCESS = 24
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Clouds:
     def __init__(self, directory: Path, scenes: SceneSet) -> None:
         self.directory = directory
         self.records: list[SceneRecord] = list(scenes.records)
-        self._arrays = _open_arrays(directory, "r")
+        self._arrays = open_arrays(directory, "r")
 
     def __len__(self) -> int:
         return len(self.records)
@@ -75,18 +74,28 @@ class Clouds:
         return int(self._arrays["count"][index])
 
     def __getitem__(self, index: int) -> Scene:
+        """Scene ``index``.
+
+        Raises:
+            ValueError: when its stored cloud is damaged.
+        """
         record = self.records[index]
         count = self.count(index)
         normals = self._arrays["normals"][index, :count].astype(np.float32) / 127.0
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return Scene(
-            points=np.array(self._arrays["points"][index, :count]),
-            normals=normals / np.maximum(length, 1e-6),
-            instance_ids=self._arrays["instance_ids"][index, :count].astype(np.int32),
-            camera_from_part=record.camera_from_part,
-            visible_fraction=record.visible_fraction,
-            part_ids=np.zeros(len(record.camera_from_part), dtype=np.int32),
-        )
+        try:
+            return Scene(
+                points=np.array(self._arrays["points"][index, :count]),
+                normals=normals / np.maximum(length, 1e-6),
+                instance_ids=self._arrays["instance_ids"][index, :count].astype(np.int32),
+                camera_from_part=record.camera_from_part,
+                visible_fraction=record.visible_fraction,
+                part_ids=np.zeros(len(record.camera_from_part), dtype=np.int32),
+            )
+        except ValueError as error:
+            raise ValueError(
+                f"cloud {index} is damaged ({error}): delete the folder {self.directory} to measure it again"
+            ) from error
 
 
 def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> Scene:
@@ -98,7 +107,9 @@ def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) ->
     scene = synthesize(record, caster, settings.sensor, settings.density, rng)
     if len(scene.points) < 3:
         empty = np.zeros((0, 3), dtype=np.float32)
-        return Scene(empty, np.zeros(0, np.int32), scene.camera_from_part, scene.visible_fraction, scene.part_ids, empty)
+        return Scene(
+            empty, np.zeros(0, np.int32), scene.camera_from_part, scene.visible_fraction, scene.part_ids, empty
+        )
     kept = sample_indices(len(scene.points), min(settings.pool, len(scene.points)), rng)
     points = scene.points[kept]
     normals = estimate_normals(scene.points, points, settings.neighbors)
@@ -111,80 +122,65 @@ def measure_clouds(
 ) -> Clouds:
     """Measure what is missing of a scene set's clouds and open them.
 
-    A scene's row is written before its mark, so that an interrupted call, also by kill -9, goes on where it was.
+    A scene's row is written before its mark, so that an interrupted call, also by kill -9, goes on where it was; a
+    second process waits for the first.
 
     Args:
         scenes: the scene set.
         part: its part.
         settings: sensor, density, pool.
         root: clouds are kept in ``root/<part>/<key>``.
-        workers: processes.
+        workers: processes; the result does not depend on it.
         progress: show a progress bar on stderr.
+
+    Raises:
+        ValueError: when the stored clouds are damaged.
+        OSError: when a worker process died; what is measured is kept and the next call goes on from there.
     """
     directory = root / part.name / settings.key(scenes.digest)[:16]
-    if not (directory / "count.npy").exists():
-        _create_arrays(directory, len(scenes), settings.pool)
-    done = _open_arrays(directory, "r")["done"]
-    missing = [int(i) for i in np.flatnonzero(done == 0)]
-    tasks = [missing[i : i + _SCENES_PER_TASK] for i in range(0, len(missing), _SCENES_PER_TASK)]
-    if tasks:
-        results = _run(tasks, workers, (directory, scenes, part, settings))
-        if progress:
-            from rich.console import Console
-            from rich.progress import track
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
+        create_arrays(directory, len(scenes), settings.pool)
+        done = open_arrays(directory, "r")["done"]
+        missing = [int(i) for i in np.flatnonzero(done == 0)]
+        tasks = [missing[i : i + _SCENES_PER_TASK] for i in range(0, len(missing), _SCENES_PER_TASK)]
+        if tasks:
+            from attentionvote.data.cloud_pool import run_tasks
 
-            results = track(results, f"{part.name}: measuring clouds", len(tasks), console=Console(stderr=True))
-        for _ in results:
-            pass
+            # A process needs seconds to start, a scene a fraction of one.
+            results = run_tasks(
+                tasks, min(workers, len(missing) // _SCENES_PER_PROCESS), directory, scenes, part, settings
+            )
+            if progress:
+                from rich.console import Console
+                from rich.progress import track
+
+                console = Console(stderr=True)
+                for _ in track(results, f"{part.name}: measuring clouds", len(tasks), console=console):
+                    pass
+            for _ in results:
+                pass
     return Clouds(directory, scenes)
 
 
-_Job = tuple[Path, SceneSet, Part, CloudSettings]
-_worker: Callable[[list[int]], None] | None = None
+def measure_into(arrays: dict[str, NDArray], index: int, scene: Scene) -> None:
+    """Store scene ``index``; its mark comes last."""
+    count = len(scene.points)
+    assert scene.normals is not None
+    arrays["points"][index, :count] = scene.points
+    arrays["normals"][index, :count] = np.round(scene.normals * 127)
+    arrays["instance_ids"][index, :count] = scene.instance_ids
+    arrays["count"][index] = count
+    arrays["done"][index] = 1
 
 
-def _run(tasks: list[list[int]], workers: int, job: _Job) -> Iterator[None]:
-    if workers <= 1:
-        _start_worker(*job)
-        assert _worker is not None
-        yield from map(_worker, tasks)
+def create_arrays(directory: Path, scenes: int, pool: int) -> None:
+    """Empty arrays for ``scenes`` clouds of at most ``pool`` points, unless they are there."""
+    if (directory / "count.npy").exists():
         return
-    context = multiprocessing.get_context("forkserver")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=job) as pool:
-        futures = [pool.submit(_work, task) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-
-
-def _work(task: list[int]) -> None:
-    assert _worker is not None
-    _worker(task)
-
-
-def _start_worker(directory: Path, scenes: SceneSet, part: Part, settings: CloudSettings) -> None:
-    global _worker
-    arrays, caster = _open_arrays(directory, "r+"), PartCaster(part)
-
-    def work(task: list[int]) -> None:
-        for index in task:
-            scene = measure(scenes.records[index], caster, settings)
-            count = len(scene.points)
-            assert scene.normals is not None
-            arrays["points"][index, :count] = scene.points
-            arrays["normals"][index, :count] = np.round(scene.normals * 127)
-            arrays["instance_ids"][index, :count] = scene.instance_ids
-            arrays["count"][index] = count
-            arrays["done"][index] = 1
-
-    _worker = work
-
-
-def _create_arrays(directory: Path, scenes: int, pool: int) -> None:
-    directory.mkdir(parents=True, exist_ok=True)
+    for leftover in directory.glob(".*.npy.*"):
+        leftover.unlink()
     shapes: dict[str, tuple[tuple[int, ...], type]] = {
         "points": ((scenes, pool, 3), np.float32),
         "normals": ((scenes, pool, 3), np.int8),
@@ -193,11 +189,24 @@ def _create_arrays(directory: Path, scenes: int, pool: int) -> None:
         "count": ((scenes,), np.int32),  # last: its presence says that all are there
     }
     for name, (shape, dtype) in shapes.items():
-        temporary = directory / f".{name}.{os.getpid()}"
+        temporary = directory / f".{name}.npy.{os.getpid()}"
         np.lib.format.open_memmap(temporary, mode="w+", dtype=dtype, shape=shape).flush()
         temporary.replace(directory / f"{name}.npy")
 
 
-def _open_arrays(directory: Path, mode: str) -> dict[str, NDArray]:
-    names = ("points", "normals", "instance_ids", "done", "count")
-    return {name: np.load(directory / f"{name}.npy", mmap_mode=mode) for name in names}  # type: ignore[arg-type]
+def open_arrays(directory: Path, mode: str) -> dict[str, NDArray]:
+    """The arrays of a directory, mapped into memory.
+
+    Raises:
+        ValueError: when a file is missing or damaged.
+    """
+    arrays = {}
+    for name in ("points", "normals", "instance_ids", "done", "count"):
+        try:
+            arrays[name] = np.load(directory / f"{name}.npy", mmap_mode=mode)  # type: ignore[arg-type]
+        except (OSError, ValueError, EOFError) as error:
+            raise ValueError(
+                f"{directory / name}.npy must hold the {name} of measured clouds, but it is missing or damaged: "
+                f"delete the folder {directory} to measure them again"
+            ) from error
+    return arrays

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import lightning as L
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from attentionvote.data.clouds import Clouds
@@ -20,7 +21,9 @@ class CloudSamples(Dataset[Batch]):
     what an uninterrupted one would have seen.
     """
 
-    def __init__(self, clouds: Clouds, points: int, layout: Layout, augmentation: Augmentation | None, seed: int) -> None:
+    def __init__(
+        self, clouds: Clouds, points: int, layout: Layout, augmentation: Augmentation | None, seed: int
+    ) -> None:
         self.clouds, self.points, self.layout = clouds, points, layout
         self.augmentation, self.seed = augmentation, seed
         self.scenes = [i for i in range(len(clouds)) if clouds.count(i) >= 3]
@@ -83,6 +86,12 @@ class PartDataModule(L.LightningDataModule):
         self.train = CloudSamples(train, points, layout, augmentation, seed)
         self.val = CloudSamples(val, points, layout, None, seed)
         self.test = CloudSamples(test, points, layout, None, seed)
+        for name, samples in (("training", self.train), ("validation", self.val), ("test", self.test)):
+            if not len(samples):
+                raise ValueError(
+                    f"the {name} scenes must have points, but all {len(samples.clouds)} clouds in "
+                    f"{samples.clouds.directory} are empty"
+                )
         if len(self.train) < batch_size:
             raise ValueError(f"batch_size must be at most the {len(self.train)} training scenes, got {batch_size}")
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
@@ -107,6 +116,11 @@ class PartDataModule(L.LightningDataModule):
     def test_dataloader(self) -> DataLoader[Batch]:
         """The test scenes, always the same samples."""
         return self._plain(self.test)
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Neighbourhoods are nested tuples, which Lightning would rebuild as lists."""
+        del dataloader_idx
+        return batch.to(device)
 
     def _plain(self, samples: CloudSamples) -> DataLoader[Batch]:
         return DataLoader(samples, batch_size=self.batch_size, collate_fn=collate, num_workers=0)

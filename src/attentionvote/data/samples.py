@@ -39,6 +39,18 @@ class Batch(NamedTuple):
     visible: Tensor
     part: Tensor
 
+    def to(self, device: torch.device | str) -> Batch:
+        """The same on another device."""
+        return Batch(**{name: getattr(self, name).to(device) for name in self._fields})
+
+    def first(self, count: int) -> Batch:
+        """Only the first ``count`` samples."""
+        found = Neighborhoods(
+            self.found.order[:count],
+            *(tuple(level[:count] for level in levels) for levels in self.found[1:]),
+        )
+        return Batch(**{name: getattr(self, name)[:count] for name in self._fields if name != "found"}, found=found)
+
 
 @dataclass(frozen=True)
 class Augmentation:
@@ -55,7 +67,11 @@ class Augmentation:
     jitter_mm: float = 0.0
 
     def apply(
-        self, points: NDArray[np.float32], normals: NDArray[np.float32], poses: NDArray[np.float64], rng: np.random.Generator
+        self,
+        points: NDArray[np.float32],
+        normals: NDArray[np.float32],
+        poses: NDArray[np.float64],
+        rng: np.random.Generator,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
         """Moved points ``(N, 3)``, normals ``(N, 3)`` and poses ``(I, 4, 4)``."""
         turn = rotation_about([0, 0, 1], rng.uniform(0, 2 * np.pi) if self.roll else 0.0)

@@ -22,7 +22,8 @@ def scene_results(
         confidence_threshold: proposals with less confidence are dropped.
     """
     results = []
-    heat, confidence = predictions.peak_heat.cpu().numpy(), predictions.confidence.cpu().numpy()
+    # Half precision (bf16-mixed) has no counterpart in numpy.
+    heat, confidence = predictions.peak_heat.float().cpu().numpy(), predictions.confidence.float().cpu().numpy()
     rotation = matrix_from_quaternion(predictions.quaternion.double().cpu().numpy())
     poses = transform(rotation, predictions.center.double().cpu().numpy())
     kept = (heat >= peak_threshold) & (confidence >= confidence_threshold)

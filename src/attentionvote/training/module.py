@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import lightning as L
@@ -12,6 +13,7 @@ from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.model import AttentionVote, Predictions
 from attentionvote.part import Part
+from attentionvote.training.checkpoint import KEY
 from attentionvote.training.detections import scene_results
 from attentionvote.training.losses import AttentionVoteLoss, batch_loss
 from attentionvote.training.schedule import Schedule
@@ -29,6 +31,7 @@ class PoseTraining(L.LightningModule):
         learning_rate, weight_decay: of the optimiser.
         peak_threshold: heat a proposal needs to count at validation (paper: 0.4).
         train_heat: heat a proposal needs to be trained on.
+        metadata: plain values that every checkpoint carries, see ``checkpoint.load_trained``.
     """
 
     def __init__(
@@ -42,8 +45,10 @@ class PoseTraining(L.LightningModule):
         weight_decay: float = 0.0,
         peak_threshold: float = 0.4,
         train_heat: float = 0.1,
+        metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
+        self.metadata = dict(metadata or {})
         self.model, self.loss, self.part, self.schedule = model, loss, part, schedule
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.peak_threshold, self.train_heat = peak_threshold, train_heat
@@ -64,8 +69,7 @@ class PoseTraining(L.LightningModule):
         return total
 
     def on_validation_epoch_start(self) -> None:
-        """Inference looks at votes within the test radius."""
-        self.model.voting_radius = self.voting_radius
+        """Nothing is found yet."""
         self.results = []
 
     def validation_step(self, batch: Batch, _: int) -> None:
@@ -89,7 +93,8 @@ class PoseTraining(L.LightningModule):
 
     @torch.no_grad()
     def detect(self, batch: Batch) -> list[SceneResult]:
-        """Detections of a batch beside its truth."""
+        """Detections of a batch beside its truth; inference looks at votes within the test radius."""
+        self.model.voting_radius = self.voting_radius
         predictions: Predictions = self.model(batch.points, batch.normals, batch.found)
         return scene_results(predictions, batch, self.peak_threshold)
 
@@ -106,7 +111,6 @@ class PoseTraining(L.LightningModule):
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, _: int) -> Batch:
-        """Neighbourhoods are nested tuples, which Lightning would rebuild as lists."""
-        moved = {k: getattr(batch, k).to(device) for k in batch._fields}
-        return Batch(**moved)
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what is needed to build the network again without the configuration."""
+        checkpoint[KEY] = dict(self.metadata)

@@ -1,0 +1,140 @@
+"""Which training a configuration means, where it lives, and whether it can work: known before torch is imported."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from configuration import ConfigurationError
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.part import Part
+from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_specs
+
+log = logging.getLogger("attentionvote.train")
+# What may change between two calls that mean the same training: it does not change what is learned.
+_NOT_IDENTITY = ("resume", "force", "workers", "tracking", "outputs", "root", "data.workers", "trainer.threads")
+RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """One training: ``directory`` for its files, the ``part``, and the scene sets it needs by split."""
+
+    directory: Path
+    part: Part
+    specs: dict[str, SceneSetSpec]
+
+    @property
+    def run_id(self) -> str | None:
+        """Of the MLflow run, once there is one."""
+        run_id = (_read_json(self.directory / RUN) or {}).get("run_id")
+        return run_id if isinstance(run_id, str) else None
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """What the training ended with; None while it is not complete or when its model is gone."""
+        result = _read_json(self.directory / RESULT)
+        if result is not None and not (self.directory / MODEL).is_file():
+            log.warning("%s is gone: the training is completed again", self.directory / MODEL)
+            return None
+        return result
+
+    def forget(self) -> None:
+        """Remove everything this training has written so far; its MLflow run stays."""
+        for path in self.directory.iterdir():
+            if path.name != ".lock":
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Be the only process of this training.
+
+        Raises:
+            ConfigurationError: when another one is at it, or the folder cannot be written.
+        """
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            lock = (self.directory / ".lock").open("w")
+        except OSError as error:
+            reason = error.strerror or error
+            raise ConfigurationError(f"outputs={self.directory.parents[1]} cannot be written: {reason}") from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, also on kill -9
+            except BlockingIOError as error:
+                raise ConfigurationError(
+                    f"another process is at this training ({self.directory}): wait for it, or end it"
+                ) from error
+            yield
+
+
+def find_training(cfg: DictConfig) -> TrainingJob:
+    """The training of a configuration: new, interrupted or complete; the configuration's parts are checked together.
+
+    Raises:
+        ValueError: with one sentence, when the parts of the configuration do not fit together.
+        OSError: when the part's mesh is missing.
+    """
+    part: Part = instantiate(cfg.object)
+    specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation, resolve=True))
+    _check(cfg, specs)
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)
+    for key in _NOT_IDENTITY:
+        section, _, leaf = key.rpartition(".")
+        (plain[section] if section else plain).pop(leaf, None)
+    digest = hashlib.sha256(json.dumps([plain, part.digest], sort_keys=True).encode()).hexdigest()
+    return TrainingJob(Path(cfg.outputs) / part.name / digest[:12], part, specs)
+
+
+def _check(cfg: DictConfig, specs: dict[str, SceneSetSpec]) -> None:
+    from attentionvote.tracking.store import resolve_store
+
+    resolve_store(cfg.tracking.store)
+    Sensor(**cfg.data.sensor)
+    for split in ("train", "val", "test"):
+        if split not in specs:
+            raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
+    scenes = specs["train"].cycles * len(specs["train"].drop_counts)
+    if cfg.trainer.batch_size > scenes:
+        raise ValueError(
+            f"trainer.batch_size must be at most the {scenes} training scenes, got {cfg.trainer.batch_size}"
+        )
+    if cfg.data.pool > cfg.data.density:
+        raise ValueError(f"data.pool must be at most data.density ({cfg.data.density}), got {cfg.data.pool}")
+    if cfg.data.points < cfg.model.centers[0]:
+        raise ValueError(
+            f"data.points must be at least model.centers[0] ({cfg.model.centers[0]}), got {cfg.data.points}"
+        )
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a file whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text())
+        return content if isinstance(content, dict) else None
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        log.warning("%s is damaged and is passed over", path)
+        return None

@@ -1,0 +1,117 @@
+"""What a finished training is worth: figures of the test scenes, pictures, the model file, the JSON line."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from attentionvote.data import PartDataModule
+from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, curves, evaluate
+from attentionvote.evaluation.scores import THRESHOLDS
+from attentionvote.training import AttentionVoteLoss, PoseTraining
+from attentionvote.training.checkpoint import load_weights, save_trained
+from attentionvote.training.operating_point import best_threshold, confident
+from attentionvote.training.pictures import picture_inputs
+
+log = logging.getLogger("attentionvote.train")
+_LEAST_HISTORY = 10  # logged steps from which on it can be said whether a loss fell
+
+
+def assess(
+    module: PoseTraining,
+    data: PartDataModule,
+    weights: Path,
+    model_file: Path,
+    tracked: Any,
+    device: torch.device,
+    step: int,
+) -> dict[str, Any]:
+    """Test the weights of a checkpoint on scenes never seen, log the figures, write ``model_file``.
+
+    The confidence threshold is chosen on the validation scenes.
+
+    Returns:
+        ``metrics`` (see ``attentionvote.evaluation.evaluate``; precision and recall at the threshold),
+        ``confidence_threshold`` and ``test_scenes``.
+    """
+    load_weights(module, weights)
+    module.eval().to(device)
+    found = {name: _detect(module, data, name, device) for name in ("val", "test")}
+    threshold = best_threshold(found["val"], module.part)
+    everything = evaluate(found["test"], module.part)
+    kept = evaluate(confident(found["test"], threshold), module.part)
+    # Average precision is an area over all confidences; precision and recall belong to the working point.
+    metrics = {k: v if k.startswith(("ap_", "map_", "f1_")) else kept.get(k, v) for k, v in everything.items()}
+    tracked.log_metrics({f"test/{k}": v for k, v in metrics.items()} | {"test/confidence_threshold": threshold}, step)
+    metadata = module.metadata | {"confidence_threshold": threshold, "test": metrics}
+    save_trained(module.model, metadata, model_file)
+    tracked.log_file("checkpoints/model.ckpt", model_file)
+    _draw(module, data, found["test"], threshold, tracked, device)
+    return {
+        "confidence_threshold": threshold,
+        "test_scenes": len(found["test"]),
+        "metrics": {k: round(v, 4) for k, v in metrics.items()},
+    }
+
+
+def _detect(module: PoseTraining, data: PartDataModule, split: str, device: torch.device) -> list[SceneResult]:
+    loader = data.val_dataloader() if split == "val" else data.test_dataloader()
+    batches = track(loader, f"{module.part.name}: detecting, {split}", console=Console(stderr=True))
+    return [result for batch in batches for result in module.detect(batch.to(device))]
+
+
+def _draw(
+    module: PoseTraining,
+    data: PartDataModule,
+    results: list[SceneResult],
+    threshold: float,
+    tracked: Any,
+    device: torch.device,
+) -> None:
+    from attentionvote.tracking.figures import ap_threshold_figure, precision_recall_figure
+    from attentionvote.tracking.scene_pictures import scene_picture
+
+    part, metric = module.part, PoseMetric.of(module.part)
+    scores = {f"{100 * t:g} % D": average_precision(results, metric, t * part.diameter) for t in THRESHOLDS}
+    lines = {label: (s.curve_recall, s.curve_precision) for label, s in scores.items()}
+    areas = {label: s.ap for label, s in scores.items()}
+    tracked.log_figure("test/precision_recall.png", precision_recall_figure(lines, areas))
+    against = curves(results, part)
+    tracked.log_figure("test/ap_threshold.png", ap_threshold_figure(against.thresholds, {"test": against.ap}))
+    batch = next(iter(data.test_dataloader())).first(2).to(device)
+    for i, inputs in enumerate(picture_inputs(module, batch, threshold)):
+        tracked.log_figure(f"test/scene_{i}.png", scene_picture(**inputs, title=f"{part.name}, test scene {i}"))
+
+
+def log_losses(tracked: Any) -> dict[str, list[float]]:
+    """Draw every loss term over the whole run; by name the mean of its first and of its last tenth.
+
+    Raises:
+        ValueError: when the votes' loss did not fall: whatever was trained, it is no model.
+    """
+    from attentionvote.tracking.figures import loss_figure
+
+    try:
+        terms = {name: tracked.metric_history(f"train/loss/{name}") for name in AttentionVoteLoss.TERMS}
+    except Exception as error:  # a store that is away never ends a training
+        log.warning("the loss figure is left out: the tracking store does not answer (%s)", type(error).__name__)
+        return {}
+    terms = {name: history for name, history in terms.items() if history[0]}
+    if terms:
+        tracked.log_figure("train/losses.png", loss_figure(terms))
+    ends = {}
+    for name, (_, values) in terms.items():
+        count = max(1, len(values) // 10)
+        ends[name] = [round(sum(part) / count, 4) for part in (values[:count], values[-count:])]
+    if len(terms.get("vote", ([], []))[1]) >= _LEAST_HISTORY and not ends["vote"][1] < ends["vote"][0]:
+        first, last = ends["vote"]
+        raise ValueError(
+            f"the loss of the votes must fall in a training, but it went from {first:g} to {last:g}: "
+            "try a smaller trainer.learning_rate"
+        )
+    return ends
