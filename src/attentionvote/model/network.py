@@ -103,6 +103,9 @@ class AttentionVote(nn.Module):
         confidence: ``exponential`` (c = exp(s), Eq. 10) or ``quality`` (c = sigmoid(s), the expected quality).
         refinement: arguments of ``Refiner`` (points, widths, head), None for the paper's form.
         refinement_steps: refiners in a row.
+        merge_fraction: of several proposals whose final centres lie within this share of D (at most half of the part's
+            smallest extent, so that stacked parts stay apart) only the most confident keeps its confidence, the others
+            get 0; None leaves it to the peaks alone, as in the paper.
 
     Raises:
         ValueError: on an unknown ``center_seed``, ``rotation`` or ``confidence``, or an impossible layout.
@@ -135,6 +138,7 @@ class AttentionVote(nn.Module):
         confidence: Literal["exponential", "quality"] = "exponential",
         refinement: dict | None = None,
         refinement_steps: int = 2,
+        merge_fraction: float | None = None,
     ) -> None:
         super().__init__()
         for name, value, choices in (
@@ -152,6 +156,8 @@ class AttentionVote(nn.Module):
         self.proposals, self.gathered, self.classes = proposals, gathered, classes
         self.peak_window, self.center_seed = peak_window, center_seed
         self.rotation, self.confidence = rotation, confidence
+        thinnest = min(high - low for low, high in zip(*box, strict=True))
+        self.merge_radius = None if merge_fraction is None else min(merge_fraction * diameter, 0.5 * thinnest)
         self.backbone = Backbone(self.layout, widths, propagation, residual)
         width = self.backbone.width
         self.vote = shared_mlp(width, voting, 3 + width)
@@ -259,8 +265,30 @@ class AttentionVote(nn.Module):
             shaped(poses.center),
             shaped(poses.quaternion),
             shaped(poses.class_logits),
-            shaped(self.confidence_of(poses.score)),
+            self.merge(shaped(poses.center), shaped(self.confidence_of(poses.score)), peaks.heat),
         )
+
+    def merge(
+        self,
+        center: Float[Tensor, "batch proposals 3"],
+        confidence: Float[Tensor, "batch proposals"],
+        heat: Float[Tensor, "batch proposals"],
+    ) -> Float[Tensor, "batch proposals"]:
+        """Confidence 0 for a proposal that ended where a more confident one (or an equal, hotter one) ended.
+
+        Votes of one instance that lie apart make two peaks; the refinement moves both onto the instance, and only
+        there can be told that they are one. The same pairwise comparison as for the peaks of the heatmap, on the
+        final centres.
+        """
+        if self.merge_radius is None:
+            return confidence
+        valid = torch.where(heat > 0, confidence, torch.full_like(confidence, -1.0))
+        near = (center[:, :, None] - center[:, None]).square().sum(-1) < self.merge_radius**2
+        index = torch.arange(center.shape[1], device=center.device)
+        ahead = (valid[:, None] > valid[:, :, None]) | (
+            (valid[:, None] == valid[:, :, None]) & (index[None, :] < index[:, None])
+        )
+        return torch.where((near & ahead).any(-1), torch.zeros_like(confidence), confidence)
 
     def confidence_of(self, score: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows"]:
         """Confidence of a score: exp(s) with s clamped to +-8 (Eq. 10), or sigmoid(s)."""

@@ -26,7 +26,7 @@ def scene_results(
     heat, confidence = predictions.peak_heat.float().cpu().numpy(), predictions.confidence.float().cpu().numpy()
     rotation = matrix_from_quaternion(predictions.quaternion.double().cpu().numpy())
     poses = transform(rotation, predictions.center.double().cpu().numpy())
-    kept = (heat >= peak_threshold) & (confidence >= confidence_threshold)
+    kept = (heat >= peak_threshold) & (confidence >= confidence_threshold) & (confidence > 0)  # 0 = merged
     truth = transform(batch.rotation.double().cpu().numpy(), batch.center.double().cpu().numpy())
     real = (batch.center.abs().sum(-1) > 0).cpu().numpy()
     visible = batch.visible.double().cpu().numpy()

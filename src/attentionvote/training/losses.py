@@ -42,8 +42,10 @@ class LossSettings:
         assignment: a proposal is positive when its centre seed lies within this share of D of an instance.
         least_visible: instances with less visible fraction, and invisible ones, are never assigned.
         confidence: ``exponential`` (Eq. 10) or ``quality``: expected share of the thresholds 2, 5 and 10 % D that
-            the pose meets, learned as a probability; proposals that match nothing and all but the best of several on
-            one instance count as 0.
+            the pose meets, learned as a probability; proposals that match nothing count as 0.
+        one_per_instance: whether all but the best of several proposals on one instance count as 0 in ``quality``; not
+            when the network merges them itself.
+        rows_per_scene: most proposals trained on, on average over the batch; an even choice of all.
         detach_confidence: whether Eq. 10 leaves the pose's gradient alone (paper-decisions, row 33).
     """
 
@@ -52,6 +54,8 @@ class LossSettings:
     assignment: float = 0.2
     least_visible: float = 0.05
     confidence: Literal["exponential", "quality"] = "quality"
+    one_per_instance: bool = True
+    rows_per_scene: int = 64
     detach_confidence: bool = True
 
     def __post_init__(self) -> None:
@@ -155,11 +159,13 @@ class AttentionVoteLoss:
         return {"confidence": loss.mean() if len(loss) else poses.score.sum()}
 
     def quality(self, poses: Poses, assigned: Assignment, batch: Batch) -> Float[Tensor, " rows"]:
-        """Share of the thresholds 2, 5, 10 % D that each pose meets, 0 for all but the best on an instance."""
+        """Share of the thresholds 2, 5, 10 % D that each pose meets; see ``LossSettings.one_per_instance``."""
         distance = self.true_pose.distance(poses.center, poses.rotation, *self._truth(assigned, batch))
         distance = distance.masked_fill(~assigned.positive, torch.inf)
         steps = torch.tensor(QUALITY_STEPS, device=distance.device) * (10 * self.unit)
         quality = (distance[:, None] < steps).to(poses.score.dtype).mean(1)
+        if not self.settings.one_per_instance:
+            return quality
         key = assigned.sample * batch.visible.shape[1] + assigned.instance
         best = torch.full((int(batch.visible.numel()),), torch.inf, device=distance.device)
         best = best.scatter_reduce(0, key, distance, "amin")
@@ -185,6 +191,9 @@ def batch_loss(
         return terms
     peaks = model.find_peaks(votes)
     rows = torch.nonzero(peaks.heat.flatten() >= least_heat)[:, 0]
+    stride = -(-len(rows) // (loss.settings.rows_per_scene * len(batch.points)))
+    if stride > 1:  # which ones is as good as random, and the same in a continued training
+        rows = rows[int(rows.sum()) % stride :: stride]
     if len(rows) < 2:  # batch statistics need two rows
         return terms
     poses = model.regress(votes, peaks, rows)
