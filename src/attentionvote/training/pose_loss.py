@@ -46,7 +46,7 @@ class SymmetricPose:
         axis = None
         if part.symmetry.is_revolution:
             direction = np.asarray(part.symmetry.axis)
-            along = direction @ part.covariance_root @ direction
+            along = np.linalg.norm(part.covariance_root @ direction)
             across = np.sqrt(max(np.trace(part.covariance_root @ part.covariance_root) - along**2, 0.0) / 2)
             root = (np.hypot(along, across) * direction)[:, None]
             axis = torch.tensor(direction, dtype=torch.float32)
