@@ -86,7 +86,7 @@ def largest_vertex_distance(vertices: NDArray[np.float64]) -> float:
 
 def _read(path: Path) -> trimesh.Trimesh:
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)  # its repairs would hide NaN and duplicate faces
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
     except Exception as error:  # the readers raise whatever their parser does
@@ -112,10 +112,11 @@ def _check_solid(mesh: trimesh.Trimesh, name: str) -> None:
             raise ValueError(
                 f"mesh '{name}' must have faces of consistent orientation, got a surface with one side only"
             )
-    if mesh.volume < 0:
+    volume = float(np.linalg.det(mesh.vertices[mesh.faces] - mesh.vertices.mean(0)).sum()) / 6
+    if abs(volume) <= 1e-6 * float(mesh.extents.max()) ** 3:
+        raise ValueError(f"mesh '{name}' must enclose a volume, got {abs(volume):.3g} m^3")
+    if volume < 0:
         mesh.invert()
-    if not mesh.volume > 1e-6 * float(mesh.extents.max()) ** 3:
-        raise ValueError(f"mesh '{name}' must enclose a volume, got {mesh.volume:.3g} m^3")
 
 
 def write_surface(vertices: NDArray[np.float64], faces: NDArray[np.int64], path: Path) -> None:

@@ -10,7 +10,7 @@ from attentionvote.geometry.pose import rotation_about
 
 Array = NDArray[np.float64]
 
-PIECE = 0.02  # largest edge of a piece, as a fraction of the surface's bounding-box diagonal
+PIECES = 5_000  # their longest edge is that of a square of so many that would tile the surface
 FIRST_NEIGHBOURS = 8
 TEST_POINTS = 1_500
 SCREEN_POINTS = 240
@@ -21,15 +21,13 @@ class SurfaceDistance:
 
     The triangles are cut into pieces with short edges; a tree over the pieces' centroids then bounds from
     below the distance of every piece that was not measured, so the search widens until it is certain.
-    Outside of ``between`` (metres) it need not be: a distance below the first or certainly above the second
-    is returned as soon as that is known, too large by less than a piece.
     """
 
-    def __init__(self, vertices: Array, faces: NDArray[np.int64], between: tuple[float, float] = (0.0, np.inf)) -> None:
+    def __init__(self, vertices: Array, faces: NDArray[np.int64]) -> None:
         """``vertices`` ``(V, 3)`` metres, ``faces`` ``(F, 3)``."""
-        self._low, self._high = between
-        longest = PIECE * float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
-        self._pieces = _cut(vertices[faces], longest)
+        corners = vertices[faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+        self._pieces = _cut(corners, float(np.sqrt(area / PIECES)))
         centroids = self._pieces.mean(1)
         self._radius = np.linalg.norm(self._pieces - centroids[:, None], axis=-1).max(1)
         self._reach = float(self._radius.max())
@@ -38,16 +36,21 @@ class SurfaceDistance:
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         self._normals = normal / np.where(length > 0, length, 1.0)
 
-    def __call__(self, points: Array) -> Array:
-        """Distance ``(N,)`` in metres of ``points`` ``(N, 3)``."""
-        return self.nearest(points)[0]
+    def __call__(self, points: Array, between: tuple[float, float] = (0.0, np.inf)) -> Array:
+        """Distance ``(N,)`` in metres of ``points`` ``(N, 3)``; see ``nearest``."""
+        return self.nearest(points, between)[0]
 
-    def nearest(self, points: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Distance ``(N,)`` and index of the nearest piece ``(N,)``."""
-        todo, count = np.arange(len(points)), FIRST_NEIGHBOURS
+    def nearest(self, points: Array, between: tuple[float, float] = (0.0, np.inf)) -> tuple[Array, NDArray[np.int64]]:
+        """Distance ``(N,)`` and index of the nearest piece ``(N,)``.
+
+        Outside of ``between`` (metres) the search stops as soon as the distance is known to be below the
+        first or above the second; it may then be too large, by less than a piece.
+        """
+        low, high = between
         first, piece = self._tree.query(points)
         distance = point_triangle_distance(points, self._pieces[piece])
-        is_open = (distance > self._low) & (first - self._reach < self._high)
+        todo, count = np.arange(len(points)), FIRST_NEIGHBOURS
+        is_open = (distance > low) & (first - self._reach < high)
         while is_open.any():
             todo, count = todo[is_open], min(count, len(self._pieces))
             reach, near = (x.reshape(len(todo), count) for x in self._tree.query(points[todo], k=count))
@@ -60,10 +63,27 @@ class SurfaceDistance:
             distance[todo[is_better]] = each[rows, best][is_better]
             piece[todo[is_better]] = near[rows, best][is_better]
             floor = reach[:, -1] - self._reach  # no piece left out is nearer
-            is_open = (floor < np.minimum(distance[todo], self._high)) & (distance[todo] > self._low)
+            is_open = (floor < np.minimum(distance[todo], high)) & (distance[todo] > low)
             is_open &= count < len(self._pieces)
             count *= 4
         return distance, piece
+
+    def largest(self, points: Array, low: float, high: float) -> float:
+        """Largest distance in metres of ``points`` ``(N, 3)``: exact between ``low`` and ``high``, ``low`` if none is
+        larger, and above ``high`` too large by less than a piece.
+
+        Only points that may still be the farthest are measured to the end.
+        """
+        bound, _ = self.nearest(points, (np.inf, np.inf))
+        best = low
+        while (bound > best).any():
+            farthest = np.argsort(-bound)[:256]
+            exact = self(points[farthest], (best, high))
+            bound[farthest] = -np.inf
+            best = max(best, float(exact.max()))
+            if best > high:
+                break
+        return best
 
     def roughly(self, points: Array) -> Array:
         """Distance ``(N,)`` to the nearest piece's centroid: fast, too large by up to a piece's radius."""
@@ -118,13 +138,10 @@ class RotationCheck:
     corners are where a surface that is nearly symmetric differs most.
     """
 
-    def __init__(self, vertices: Array, faces: NDArray[np.int64], tolerance: float, exact: float = 0.25) -> None:
-        """``vertices`` about the point that every rotation leaves in place; ``tolerance`` in metres.
-
-        Residuals are exact between ``exact`` and 2 times the tolerance, and on the right side of these elsewhere.
-        """
+    def __init__(self, vertices: Array, faces: NDArray[np.int64], tolerance: float) -> None:
+        """``vertices`` about the point that every rotation leaves in place; ``tolerance`` in metres."""
         rng = np.random.default_rng(0)
-        self.distance = SurfaceDistance(vertices, faces, (exact * tolerance, 2 * tolerance))
+        self.distance = SurfaceDistance(vertices, faces)
         self.tolerance = tolerance
         self.radius = float(np.linalg.norm(vertices, axis=1).max())
         corners = vertices[rng.permutation(np.unique(faces))[:TEST_POINTS]]
@@ -133,10 +150,15 @@ class RotationCheck:
         outer = np.argsort(-np.linalg.norm(self.points, axis=1))[: SCREEN_POINTS // 2]
         self.screen = np.concatenate([self.points[outer], self.points[: SCREEN_POINTS // 2]])
 
-    def residual(self, rotation: Array, points: Array | None = None) -> float:
-        """Largest distance in metres between surface and turned surface, both ways."""
+    def residual(self, rotation: Array, points: Array | None = None, low: float | None = None) -> float:
+        """Largest distance in metres between surface and turned surface, both ways.
+
+        Exact from ``low`` (default: 1 % of the tolerance, below which nothing matters) to twice the tolerance; a larger
+        one is somewhat larger than true.
+        """
         p = self.points if points is None else points
-        return float(self.distance(np.concatenate([p @ rotation.T, p @ rotation])).max())
+        low = 0.01 * self.tolerance if low is None else low
+        return self.distance.largest(np.concatenate([p @ rotation.T, p @ rotation]), low, 2 * self.tolerance)
 
     def mean(self, rotation: Array) -> float:
         """Mean distance of the screening points, rough and fast: what searches minimise."""
@@ -150,7 +172,8 @@ class RotationCheck:
         """Whether every one of ``rotations`` leaves the surface in place within the tolerance."""
         order = np.argsort(np.trace(rotations, axis1=1, axis2=2))  # large angles fail first
         stages = (self.screen[:: SCREEN_POINTS // 16], self.screen, self.points)  # most fail at the first points
-        return all(self.residual(rotations[i], points) <= self.tolerance for points in stages for i in order)
+        limit = self.tolerance
+        return all(self.residual(rotations[i], points, limit) <= limit for points in stages for i in order)
 
     def refined(self, rotation: Array, rounds: int = 12) -> Array:
         """The rotation near ``rotation`` that fits the surface best: point-to-plane registration about the origin.

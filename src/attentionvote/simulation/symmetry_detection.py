@@ -80,7 +80,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
     moved = not np.array_equal(part_from_file, np.eye(4))
     # The last word: the symmetry exactly as it will be written, about the origin that it will be written for.
     fixed_point = centroid if moved else nearest_fixed_point(symmetry, centroid)
-    final = RotationCheck(vertices - fixed_point, faces, tolerance * diameter, exact=0.1)
+    final = RotationCheck(vertices - fixed_point, faces, tolerance * diameter)
     residual = max((final.residual(r) for r in tested_rotations(symmetry)), default=0.0)
     runner_up, runner_up_residual = detection.runner_up()
     return SymmetryFinding(
@@ -97,7 +97,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
 def symmetry_residual(vertices: Array, faces: NDArray[np.int64], symmetry: Symmetry) -> float:
     """Largest distance in metres between the surface and its images under ``symmetry`` (about the origin)."""
     tolerance = TOLERANCE * largest_vertex_distance(vertices)
-    check = RotationCheck(np.asarray(vertices, dtype=np.float64), faces, tolerance, exact=0.1)
+    check = RotationCheck(np.asarray(vertices, dtype=np.float64), faces, tolerance)
     return max((check.residual(r) for r in tested_rotations(symmetry)), default=0.0)
 
 

@@ -1,0 +1,73 @@
+"""Parts by configuration: built-ins, files, and the sentences when something is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+
+from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.simulation import BUILTIN_PARTS, load_part
+from attentionvote.simulation.cad import builtin_surface
+from attentionvote.simulation.mesh import write_surface
+
+FROM_DATASETS = {"bunny": 0.234355236, "tless_20": 0.107, "tless_22": 0.108, "tless_29": 0.135}
+
+
+def configured(repository: Path, name: str) -> object:
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        return compose(f"object/{name}").object
+
+
+@pytest.mark.parametrize("name", BUILTIN_PARTS)
+def test_the_configuration_of_a_builtin_says_what_the_catalogue_says(repository: Path, name: str) -> None:
+    part = instantiate(configured(repository, name))
+    assert (part.name, part.title) == (name, BUILTIN_PARTS[name].title)
+    assert part.diameter == BUILTIN_PARTS[name].diameter
+    assert part.symmetry == BUILTIN_PARTS[name].symmetry
+    assert part.digest == load_part("other", f"builtin:{name}").digest
+
+
+@pytest.mark.parametrize(("name", "diameter"), FROM_DATASETS.items())
+def test_a_dataset_part_without_its_mesh_says_where_it_belongs(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, diameter: float
+) -> None:
+    monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
+    config = configured(repository, name)
+    assert config.diameter == diameter  # type: ignore[attr-defined]
+    pattern = rf"mesh of object '{name}', .*Siléane.*, must be at '{tmp_path}/meshes/\w+\.\w+', which does not exist"
+    with pytest.raises(InstantiationException, match=pattern) as caught:
+        instantiate(config)
+    assert isinstance(caught.value.__cause__, FileNotFoundError)
+
+
+def test_a_file_gets_the_configured_diameter_and_symmetry(tmp_path: Path) -> None:
+    vertices, faces = builtin_surface("brick")
+    path = tmp_path / "block.ply"
+    write_surface(vertices * 1000, faces, path)
+    plain = load_part("block", str(path), units="mm")
+    assert plain.diameter == pytest.approx(0.037, abs=1e-7)
+    assert plain.symmetry == Symmetry()
+    np.testing.assert_allclose(plain.vertices, vertices, atol=1e-8)
+    settings = {"kind": "cyclic", "order": 2, "axis": [0, 0, 1]}
+    part = load_part("block", str(path), 0.04, "mm", settings, "A block", base_radius=0.01, voxel_size=0.001)
+    assert (part.diameter, part.symmetry, part.title) == (0.04, Symmetry("cyclic", order=2), "A block")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"symmetry": {"kind": "cyclik"}}, "symmetry kind must be one of .*, got 'cyclik'"),
+        ({"symmetry": {"kind": "cyclic", "ordr": 2}}, "symmetry must only have the keys .*order.*, got 'ordr'"),
+        ({"diameter": -1.0}, "diameter must be positive metres .*, got -1"),
+        ({"base_radius": float("nan")}, "base_radius must be positive metres .*, got nan"),
+        ({"voxel_size": 0.0}, "voxel_size must be positive metres .*, got 0.0"),
+    ],
+)
+def test_impossible_settings_are_one_sentence(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_part("gear", "builtin:gear", **settings)

@@ -1,0 +1,179 @@
+"""Detected symmetries: known solids in their own frame and in any other, false friends, the check meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from attentionvote.geometry.pose import apply, inverse, matrix_from_quaternion, random_quaternion, transform
+from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
+from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
+from attentionvote.simulation.symmetry_detection import describe, detect_symmetry, symmetry_residual
+
+ANYWHERE = transform(matrix_from_quaternion([0.3, -0.5, 0.7, 0.4]), [0.4, -1.0, 2.0])
+
+
+def angle_iron(second_arm: float) -> trimesh.Trimesh:
+    arms = [[[0, 0, 0], [1, 0.2, 0.15]], [[0, 0, 0], [0.2, second_arm, 0.15]]]
+    return trimesh.boolean.union([trimesh.creation.box(bounds=b) for b in arms])
+
+
+@cache
+def solid(name: str) -> trimesh.Trimesh:
+    c = trimesh.creation
+    return {
+        "brick": lambda: c.box([1, 0.7, 0.4]),
+        "square bar": lambda: c.box([1, 1, 1.9]),
+        "cube": lambda: c.box([1, 1, 1]),
+        "tetrahedron": lambda: trimesh.convex.convex_hull([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
+        "hexagonal prism": lambda: c.cylinder(0.5, 0.6, sections=6),
+        "cylinder": lambda: c.cylinder(0.5, 1.4, sections=64),
+        "cone": lambda: c.cone(0.4, 1.5, sections=64),
+        "equal angle iron": lambda: angle_iron(1.0),
+        "unequal angle iron": lambda: angle_iron(0.6),
+        "ball": lambda: c.icosphere(3),
+    }[name]()
+
+
+EXPECTED = {
+    "brick": ("dihedral", 2, False),
+    "hexagonal prism": ("dihedral", 6, False),
+    "cylinder": ("revolution", 1, True),
+    "cone": ("revolution", 1, False),
+    # The half turn about the diagonal in its middle plane exchanges the arms.
+    "equal angle iron": ("cyclic", 2, False),
+    "unequal angle iron": ("none", 1, False),
+    "square bar": ("dihedral", 4, False),
+}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_solid_in_any_pose_has_its_group_about_the_principal_frame(name: str) -> None:
+    mesh = solid(name)
+    vertices = apply(ANYWHERE, mesh.vertices * 0.1)
+    finding = detect_symmetry(vertices, mesh.faces)
+    assert (finding.symmetry.kind, finding.symmetry.order, finding.symmetry.flip) == EXPECTED[name]
+    # The origin was outside of the part, so it was moved to the centroid with z along the axis.
+    assert finding.moved
+    if name != "unequal angle iron":
+        assert finding.symmetry.axis == pytest.approx((0, 0, 1), abs=1e-9)
+    in_part_frame = apply(finding.part_from_file, vertices)
+    assert np.linalg.det(finding.part_from_file[:3, :3]) == pytest.approx(1)
+    assert symmetry_residual(in_part_frame, mesh.faces, finding.symmetry) <= finding.tolerance
+    assert finding.residual <= finding.tolerance < finding.runner_up_residual
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "size"), [("cube", 24), ("tetrahedron", 12)])
+@pytest.mark.parametrize("is_posed", [False, True])
+def test_a_polyhedron_has_all_its_rotations(name: str, size: int, is_posed: bool) -> None:
+    mesh = solid(name)
+    vertices = apply(ANYWHERE, mesh.vertices) if is_posed else mesh.vertices
+    finding = detect_symmetry(vertices, mesh.faces)
+    assert finding.symmetry.kind == "group"
+    rotations = finding.symmetry.rotations()
+    assert len(rotations) == size
+    assert finding.moved == is_posed
+    # Every vertex goes exactly to a vertex.
+    corners = apply(finding.part_from_file, vertices)
+    turned = np.einsum("gij,vj->gvi", rotations, corners)
+    nearest = np.linalg.norm(turned[:, :, None] - corners, axis=-1).min(-1)
+    assert nearest.max() < 1e-6
+
+
+@pytest.mark.slow
+def test_a_ball_has_no_orientation() -> None:
+    mesh = solid("ball")
+    with pytest.raises(ValueError, match="must not be a ball"):
+        detect_symmetry(mesh.vertices, mesh.faces)
+
+
+@pytest.mark.parametrize("name", ["connecting_rod", "vertical_bearing_pedestal", "brick", "gear"])
+def test_a_builtin_keeps_its_frame_and_has_the_configured_symmetry(name: str) -> None:
+    vertices, faces = builtin_surface(name)
+    finding = detect_symmetry(vertices, faces)
+    assert finding.symmetry == BUILTIN_PARTS[name].symmetry
+    assert not finding.moved
+    np.testing.assert_array_equal(finding.part_from_file, np.eye(4))
+
+
+def test_a_revolution_about_another_axis_through_the_origin_stays_there() -> None:
+    mesh = solid("cone")
+    lying = apply(transform(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), [0, 0, 0]), mesh.vertices)
+    finding = detect_symmetry(lying, mesh.faces)
+    assert finding.symmetry == Symmetry("revolution", (1.0, 0.0, 0.0))
+    assert not finding.moved
+
+
+def test_an_axis_beside_the_origin_moves_the_part() -> None:
+    vertices, faces = builtin_surface("connecting_rod")
+    shift = np.array([0.002, 0.0, 0.0])
+    finding = detect_symmetry(vertices + shift, faces)
+    assert finding.moved
+    assert finding.symmetry == Symmetry("cyclic", order=2)
+    # The bores' direction stays z; the origin goes to the surface centroid, which is on the axis.
+    np.testing.assert_allclose(inverse(finding.part_from_file)[:2, 3], shift[:2], atol=1e-6)
+    np.testing.assert_allclose(np.abs(finding.part_from_file[:3, :3]), np.eye(3), atol=1e-6)
+
+
+def test_facets_count_by_their_height_and_not_by_their_number() -> None:
+    # Sagitta r (1 - cos(pi / n)): of 8 sides 3.8 % of the radius, so a thin bar of them is round, a thick one not.
+    thin = trimesh.creation.cylinder(0.03, 1.0, sections=8)
+    thick = trimesh.creation.cylinder(0.3, 1.0, sections=8)
+    assert detect_symmetry(thin.vertices, thin.faces).symmetry == Symmetry("revolution", flip=True)
+    found = detect_symmetry(thick.vertices, thick.faces).symmetry
+    assert (found.kind, found.order) == ("dihedral", 8)
+
+
+def test_what_is_below_the_tolerance_is_no_difference() -> None:
+    c = trimesh.creation
+    for height, tolerance, kind, order in ((0.02, 0.003, "cyclic", 2), (0.02, 0.03, "dihedral", 2)):
+        mark = c.box(bounds=[[-0.2, -0.1, 0.19], [0.2, 0.1, 0.2 + height]])
+        plate = trimesh.boolean.union([c.box([1, 0.7, 0.4]), mark])
+        found = detect_symmetry(plate.vertices, plate.faces, tolerance).symmetry
+        assert (found.kind, found.order) == (kind, order)
+
+
+def test_a_random_blob_has_none() -> None:
+    rng = np.random.default_rng(4)
+    blob = trimesh.convex.convex_hull(rng.normal(size=(30, 3)))
+    finding = detect_symmetry(blob.vertices, blob.faces)
+    assert finding.symmetry == Symmetry()
+    assert finding.runner_up_residual > finding.tolerance
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, 0.2, float("nan")])
+def test_an_impossible_tolerance_is_refused(tolerance: float) -> None:
+    mesh = solid("brick")
+    with pytest.raises(ValueError, match=r"symmetry tolerance must be above 0 and at most 0\.05"):
+        detect_symmetry(mesh.vertices, mesh.faces, tolerance)
+
+
+def test_the_bunny_has_none(shared_data: Callable[[str], Path]) -> None:
+    vertices, faces = load_surface(shared_data("meshes/SileaneBunny.obj"))
+    finding = detect_symmetry(vertices, faces)
+    assert finding.symmetry == Symmetry()
+    assert not finding.moved
+    assert finding.runner_up_residual > 0.1 * largest_vertex_distance(vertices)
+
+
+def test_the_gear_shaft_is_a_revolution_about_z_without_flip(shared_data: Callable[[str], Path]) -> None:
+    vertices, faces = load_surface(shared_data("meshes/IPAGearShaft.stl"))
+    finding = detect_symmetry(vertices, faces)
+    assert finding.symmetry == Symmetry("revolution")
+    assert not finding.moved
+    assert finding.runner_up == "revolution about (0 0 1) with flip"
+
+
+def test_a_part_turned_is_the_same_part() -> None:
+    vertices, faces = builtin_surface("slider_bearing_pedestal")
+    rng = np.random.default_rng(9)
+    for _ in range(3):
+        pose = transform(matrix_from_quaternion(random_quaternion(rng)), rng.normal(size=3))
+        assert describe(detect_symmetry(apply(pose, vertices), faces).symmetry) == "cyclic of order 2 about (0 0 1)"
