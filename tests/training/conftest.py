@@ -1,0 +1,139 @@
+"""What the tests of the losses share: a box with every kind of symmetry, scenes of it, a small network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from attentionvote.data.samples import Batch, collate
+from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion
+from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.model import AttentionVote, find_neighborhoods
+from attentionvote.part import Part
+
+TILTED = (1.0, 2.0, 2.0)
+ACROSS = (2.0, 1.0, -2.0)  # perpendicular to it
+BOX_FACES = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
+BOX_FACES += [[0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+OUTWARD = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]]).repeat(2, axis=0)
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+SYMMETRIES = {
+    "none": Symmetry(),
+    "cyclic 2": Symmetry("cyclic", order=2),
+    "cyclic 3, tilted": Symmetry("cyclic", TILTED, order=3),
+    "dihedral 2": Symmetry("dihedral", order=2),
+    "dihedral 4, tilted": Symmetry("dihedral", TILTED, order=4, flip_axis=ACROSS),
+    "group": Symmetry("group", quaternions=[(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)]),
+    "revolution": Symmetry("revolution"),
+    "revolution, tilted": Symmetry("revolution", TILTED),
+    "revolution, flip": Symmetry("revolution", flip=True),
+    "revolution, flip, tilted": Symmetry("revolution", TILTED, flip=True),
+}
+LOSS_NETWORK: dict[str, Any] = {
+    "diameter": 0.1,
+    "box": [[-0.02, -0.01, -0.045], [0.02, 0.01, 0.045]],
+    "centers": [64, 48, 16, 8],
+    "neighbors": [8, 8, 4, 4],
+    "widths": [[16, 32], [32, 32], [32, 32], [32, 32]],
+    "propagation": [32, 32],
+    "residual": True,
+    "radius_fraction": 0.2,
+    "voxel_fraction": 0.055,
+    "voting": [32],
+    "vote_rotation": True,
+    "peak_window": 2,
+    "center_seed": "mean",
+    "proposals": 8,
+    "gathered": 8,
+    "fusion": [32, 32],
+    "head": [32],
+    "rotation": "six",
+    "confidence": "quality",
+    "refinement": {"points": 32, "widths": [16, 32], "head": [32]},
+}
+
+
+def box_with(symmetry: Symmetry | None = None) -> Part:
+    """A box whose diameter is called 100 mm; the symmetry is a claim, which the distances take as given."""
+    return Part("box", CORNERS * (0.02, 0.01, 0.045), np.array(BOX_FACES), 0.1, symmetry or Symmetry())
+
+
+def random_rotations(seed: int, count: int) -> np.ndarray:
+    return matrix_from_quaternion(random_quaternion(np.random.default_rng(seed), (count,)))
+
+
+def scene_sample(seed: int, instances: int, visible: float = 1.0, count: int = 160) -> Batch:
+    """Boxes side by side half a metre away, seen from the camera; some points lie on none. One sample, no batch."""
+    rng, part = np.random.default_rng(seed), box_with()
+    rotation = random_rotations(seed, instances)
+    center = np.array([[0.07 * (i - (instances - 1) / 2), 0.02 * (i % 2), 0.5] for i in range(instances)])
+    center = center.reshape(-1, 3)
+    points, normals, owner = [], [], []
+    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    for i in range(instances):
+        face = rng.choice(12, size=10 * count, p=area / area.sum())
+        u, v, _ = rng.dirichlet([1, 1, 1], 10 * count).T[..., None]
+        surface = (a[face] + u * (b - a)[face] + v * (c - a)[face]) @ rotation[i].T + center[i]
+        direction = OUTWARD[face] @ rotation[i].T
+        seen = np.flatnonzero((surface * direction).sum(1) < 0)[: (count - 8) // instances]
+        points.append(surface[seen])
+        normals.append(direction[seen])
+        owner += [i] * len(seen)
+    missing = count - len(owner)
+    points.append(rng.uniform([-0.1, -0.1, 0.5], [0.1, 0.1, 0.7], (missing, 3)))
+    normals.append(np.tile([0.0, 0, -1], (missing, 1)))
+    owner += [-1] * missing
+    order = rng.permutation(count)
+    xyz = np.concatenate(points)[order].astype(np.float32)
+    return Batch(
+        torch.from_numpy(xyz),
+        torch.from_numpy(np.concatenate(normals)[order].astype(np.float32)),
+        torch.tensor(owner)[torch.from_numpy(order)],
+        find_neighborhoods(xyz, loss_network().layout),
+        torch.from_numpy(center).float(),
+        torch.from_numpy(rotation).float(),
+        torch.full((instances,), visible),
+        torch.zeros(instances, dtype=torch.long),
+    )
+
+
+def loss_network(**changes: Any) -> AttentionVote:
+    torch.manual_seed(0)
+    return AttentionVote(**(LOSS_NETWORK | changes))
+
+
+# Functions as fixtures of the session: test modules cannot import each other, and hypothesis wants no other scope.
+@pytest.fixture(scope="session")
+def make_box() -> Callable[..., Part]:
+    return box_with
+
+
+@pytest.fixture(scope="session", params=SYMMETRIES)
+def symmetric_part(request: pytest.FixtureRequest) -> Part:
+    return box_with(SYMMETRIES[request.param])
+
+
+@pytest.fixture(scope="session")
+def make_rotations() -> Callable[..., np.ndarray]:
+    return random_rotations
+
+
+@pytest.fixture(scope="session")
+def make_network() -> Callable[..., AttentionVote]:
+    return loss_network
+
+
+@pytest.fixture(scope="session")
+def make_sample() -> Callable[..., Batch]:
+    return scene_sample
+
+
+@pytest.fixture(scope="session")
+def make_scenes() -> Callable[..., Batch]:
+    """A batch of scenes with these numbers of instances."""
+    return lambda *instances: collate([scene_sample(7 + i, n) for i, n in enumerate(instances)])
