@@ -1,4 +1,4 @@
-"""The look from the predicted pose: points in the part's box against a loop, and how corrections move with the scene."""
+"""The look from the predicted pose: points in the part's box against a loop; corrections move with the scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOX = torch.tensor([[-0.02, -0.03, -0.05], [0.02, 0.03, 0.01]])
 def poses(seed: int, rows: int) -> tuple[Tensor, Tensor]:
     """Centres near half a metre ahead (the first far from every point) and rotations."""
     rng = np.random.default_rng(seed)
-    center = rng.normal(0, 0.03, (rows, 3)) + [0, 0, 0.5]
+    center = rng.normal([0, 0, 0.5], 0.03, (rows, 3))
     center[0] = [3, 0, 0]
     rotation = Rotation.random(rows, random_state=seed).as_matrix()
     return torch.from_numpy(center).float(), torch.from_numpy(rotation).float()

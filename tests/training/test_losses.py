@@ -82,7 +82,7 @@ def test_true_votes_of_a_symmetric_part_cost_nothing(make_box: Callable, batch: 
     half_turn = torch.from_numpy(part.symmetry.rotations()[1]).float()
     votes = votes_at(batch.center[rows, instance], index, batch.rotation[rows, instance] @ half_turn)
     terms = AttentionVoteLoss(part, WEIGHTS, LossSettings()).vote_terms(votes, batch)
-    assert terms["vote"] < 1e-4
+    assert terms["vote"] < 2e-4  # the micrometre that keeps the gradient bounded, in tenths of the diameter
     assert terms["vote_rotation"] < 1e-4
     unlike = votes._replace(rotation=batch.rotation[rows, instance].flip(-1))
     assert AttentionVoteLoss(part, WEIGHTS, LossSettings()).vote_terms(unlike, batch)["vote_rotation"] > 0.1
@@ -93,7 +93,8 @@ def test_proposals_belong_to_the_nearest_visible_instance_within_the_threshold(
 ) -> None:
     batch = batch._replace(visible=torch.tensor([[1.0, 0.01, 0.5], [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]))
     rng = np.random.default_rng(1)
-    seeds = torch.from_numpy(rng.uniform([-0.1, -0.03, 0.48], [0.1, 0.03, 0.52], (3, 8, 3))).float()
+    near = batch.center[:, torch.arange(8) % 3].numpy()
+    seeds = torch.from_numpy(rng.normal(near, 0.011)).float()
     seeds[1, 0] = 0.0  # where padding lies
     rows = torch.arange(24)[::2]
     for least in (0.05, 0.0):
