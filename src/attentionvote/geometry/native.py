@@ -55,7 +55,7 @@ def call(function: ctypes._NamedFuncPointer, *arguments: object) -> None:
 
     The interpreter's lock is released during the call, so several threads may work at once.
     """
-    converted = []
+    converted: list[object] = []
     for argument in arguments:
         if argument is None:
             converted.append(ctypes.c_void_p(None))

@@ -61,7 +61,9 @@ def estimate_normals(
         if value.ndim != 2 or value.shape[1] != 3:
             raise ValueError(f"{name} must have shape (P, 3), got {value.shape}")
         if not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, got {int((~np.isfinite(value)).any(axis=1).sum())} with NaN or inf")
+            raise ValueError(
+                f"{name} must be finite, got {int((~np.isfinite(value)).any(axis=1).sum())} with NaN or inf"
+            )
     if len(points) < 3:
         raise ValueError(f"normals need at least 3 points, got {len(points)}")
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False, leafsize=32)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry import native, sampling_reference
 
+
 def farthest_point_order(points: NDArray[np.float32], count: int) -> NDArray[np.int64]:
     """Indices ``(count,)`` of points so that each is the farthest from all before it; starts at index 0.
 

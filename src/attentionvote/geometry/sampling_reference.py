@@ -1,4 +1,4 @@
-"""Slow, obvious numpy versions of the operators in ``sampling``: their oracle, and their stand-in without a compiler."""
+"""Slow, plain numpy versions of the operators in ``sampling``: their oracle, their stand-in without a compiler."""
 
 from __future__ import annotations
 
