@@ -19,7 +19,7 @@ from attentionvote.geometry import native
 # The paper's kernel: 3x3x3, sigma one voxel, sum one: centre 0.0923, face 0.0560, edge 0.0339, corner 0.0206.
 _SIDE = math.exp(-0.5)
 _CENTER = 1.0 / (1.0 + 2.0 * _SIDE) ** 3
-_TIE = 1e-4  # heats closer than this are equal: far above the rounding of a sum of hundreds of votes, below 0.001 votes
+_TIE = 1e-4  # heats closer than this are equal: a thousandth of a vote, far above the rounding of a sum of hundreds
 
 
 class Peaks(NamedTuple):
