@@ -56,7 +56,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     _write(mesh, lambda path: write_surface(part.vertices, part.faces, path))
     _write(picture, lambda path: write_picture(part, path))
     text = configuration_text(part, finding, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
-    _write(config, lambda path: path.write_text(text, encoding="utf-8") and None)
+    _write(config, lambda path: path.write_text(text, encoding="utf-8"))
     log.info("look at %s, then: make train OBJECT=%s", picture, name)
     return {
         "stage": "part",
@@ -154,7 +154,7 @@ def _checked_name(cfg: DictConfig) -> str:
     return name
 
 
-def _write(path: Path, write: Callable[[Path], None]) -> None:
+def _write(path: Path, write: Callable[[Path], object]) -> None:
     """Whole or not at all: under another name first."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
