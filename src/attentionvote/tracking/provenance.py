@@ -25,6 +25,7 @@ class GitState:
 
     @property
     def is_dirty(self) -> bool:
+        """Whether the work tree differs from the commit."""
         return bool(self.status)
 
 
