@@ -10,6 +10,7 @@ import lightning as L
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column
 
 _REDRAW_S = 0.5
 _LOSS = "train/loss/"
@@ -39,8 +40,10 @@ class TrainingProgress(Callback):
         if not self.console.is_terminal:
             return
         columns = (TextColumn("training"), BarColumn(20), TextColumn("{task.completed}/{task.total}"))
-        times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[state]}"))
-        self.bar = Progress(*columns, *times, console=self.console, speed_estimate_period=300)
+        # On a narrow terminal the losses are cut, not the time left.
+        state = TextColumn("{task.fields[state]}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"))
+        times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), state)
+        self.bar = Progress(*columns, *times, console=self.console, speed_estimate_period=300, expand=True)
         self.task = self.bar.add_task("", total=_total(trainer), completed=trainer.global_step, state="")
         self.bar.start()
 
