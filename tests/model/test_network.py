@@ -221,3 +221,31 @@ GOLDEN = {
     "quaternion": [0.76481, -0.32313, -0.01966, -0.55702],
     "confidence": [0.47595, 0.4782, 0.47435, 0.47693],
 }
+
+
+def merged(model: AttentionVote, center: list[list[float]], confidence: list[float], heat: list[float]) -> list[float]:
+    """Confidences after the merging of one sample."""
+    return model.merge(torch.tensor([center]), torch.tensor([confidence]), torch.tensor([heat]))[0].tolist()
+
+
+def test_of_proposals_that_end_in_one_place_the_most_confident_stays(make_network: Callable) -> None:
+    # 0.1 of the small network's diameter is 10 mm.
+    near = [[0.0, 0.0, 0.5], [0.009, 0.0, 0.5], [0.0, 0.011, 0.5]]
+    assert merged(make_network(merge_fraction=0.1), near, [0.25, 0.5, 0.125], [1.0, 1.0, 1.0]) == [0.0, 0.5, 0.125]
+
+
+def test_of_equally_confident_proposals_in_one_place_the_hotter_stays(make_network: Callable) -> None:
+    assert merged(make_network(merge_fraction=0.1), [[0.0, 0.0, 0.5]] * 2, [0.5, 0.5], [2.0, 1.0]) == [0.5, 0.0]
+
+
+def test_a_place_without_heat_silences_nobody(make_network: Callable) -> None:
+    assert merged(make_network(merge_fraction=0.1), [[0.0, 0.0, 0.5]] * 2, [0.9, 0.5], [0.0, 1.0])[1] == 0.5
+
+
+def test_without_merging_every_proposal_keeps_its_confidence(make_network: Callable) -> None:
+    assert merged(make_network(), [[0.0, 0.0, 0.5]] * 2, [0.5, 0.25], [1.0, 1.0]) == [0.5, 0.25]
+
+
+def test_flat_parts_merge_only_within_half_their_thickness(make_network: Callable) -> None:
+    thin = make_network(merge_fraction=0.1, box=[[-0.03, -0.03, -0.004], [0.03, 0.03, 0.004]])
+    assert thin.merge_radius == pytest.approx(0.004)

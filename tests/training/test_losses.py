@@ -185,6 +185,17 @@ def test_quality_is_the_share_of_thresholds_met_and_duplicates_get_none(
     np.testing.assert_allclose(loss.quality_term(poses, assigned, batch)["confidence"], expected, rtol=1e-5)
 
 
+def test_quality_judges_each_for_itself_where_the_network_merges(
+    make_box: Callable, batch: Batch, assigned: Assignment
+) -> None:
+    loss = AttentionVoteLoss(make_box(), WEIGHTS, LossSettings(one_per_instance=False))
+    at = assigned.sample, assigned.instance
+    rotation, center = batch.rotation[at].double().numpy(), batch.center[at].double().numpy()
+    center[:, 0] += [0.0015, 0.003, 0.001, 0.007, 0.0, 0.02]
+    quality = loss.quality(poses_of(rotation, center), assigned, batch)
+    np.testing.assert_allclose(quality, [1.0, 2 / 3, 1.0, 1 / 3, 0.0, 0.0], atol=1e-6)
+
+
 def test_quality_knows_the_symmetry(make_box: Callable, batch: Batch, assigned: Assignment) -> None:
     part: Part = make_box(Symmetry("cyclic", order=2))
     at = assigned.sample, assigned.instance
@@ -268,6 +279,22 @@ def test_peaks_without_heat_are_left_out_and_too_few_leave_the_votes_alone(
     loss = AttentionVoteLoss(make_box(), WEIGHTS, LossSettings())
     assert batch_loss(model, loss, batch, ramp=0.0, least_heat=0.1).keys() == {"vote", "vote_rotation"}
     assert batch_loss(model, loss, batch, ramp=1.0, least_heat=1e9).keys() == {"vote", "vote_rotation"}
+
+
+def test_rows_per_scene_bounds_what_is_trained_on(
+    make_box: Callable, make_network: Callable, make_scenes: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, batch = make_network().train(), make_scenes(2, 3)
+    seen = []
+    regress = model.regress
+    monkeypatch.setattr(model, "regress", lambda votes, peaks, rows: seen.append(rows) or regress(votes, peaks, rows))
+    for most in (1000, 2, 2):
+        loss = AttentionVoteLoss(make_box(), WEIGHTS, LossSettings(rows_per_scene=most))
+        batch_loss(model, loss, batch, ramp=1.0, least_heat=0.01)
+    everything, some, again = seen
+    assert len(everything) > 4 >= len(some) > 0
+    assert set(some.tolist()) < set(everything.tolist())
+    assert again.tolist() == some.tolist()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from attentionvote.model.backbone import Backbone
 from attentionvote.model.fusion import AttentionVoting
 from attentionvote.model.layers import shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
+from attentionvote.model.precision import widened
 from attentionvote.model.proposals import Peaks, gather_votes, heatmap_peaks
 from attentionvote.model.refinement import Refined, Refiner
 from attentionvote.model.rotation import (
@@ -186,7 +187,7 @@ class AttentionVote(nn.Module):
         residual = self.vote(seed_feature)
         xyz = seed_xyz + residual[..., :3] * (0.5 * self.diameter)
         feature = seed_feature + residual[..., 3:]
-        rotation = None if self.vote_rotation is None else self._matrix(self.vote_rotation(feature))
+        rotation = None if self.vote_rotation is None else self._matrix(widened(self.vote_rotation(feature)))
         return Votes(found.order[:, : self.layout.seeds], xyz, feature, rotation)
 
     def find_peaks(self, votes: Votes) -> Peaks:
@@ -209,7 +210,7 @@ class AttentionVote(nn.Module):
         offsets = (votes.xyz.flatten(0, 1)[index] - seed[:, None]) / self.voting_radius
         fused = self.fusion(offsets, votes.feature.flatten(0, 1), index)
         feature = self.head(fused)
-        out = self.output(feature)
+        out = widened(self.output(feature))
         center = seed + out[:, :3] * (0.1 * self.diameter)
         raw = out[:, 3 : -1 - self.classes]
         rotation = self._matrix(raw)
@@ -277,8 +278,8 @@ class AttentionVote(nn.Module):
         """Confidence 0 for a proposal that ended where a more confident one (or an equal, hotter one) ended.
 
         Votes of one instance that lie apart make two peaks; the refinement moves both onto the instance, and only
-        there can be told that they are one. The same pairwise comparison as for the peaks of the heatmap, on the
-        final centres.
+        there can be told that they are one. The paper leaves duplicates to the peaks alone (no suppression of any
+        kind, ``merge_fraction`` None); peaks fine enough to find half-hidden instances then double the visible ones.
         """
         if self.merge_radius is None:
             return confidence
