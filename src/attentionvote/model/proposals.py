@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from attentionvote.geometry import native
+from attentionvote.model.precision import full_precision
 
 # The paper's kernel: 3x3x3, sigma one voxel, sum one: centre 0.0923, face 0.0560, edge 0.0339, corner 0.0206.
 _SIDE = math.exp(-0.5)
@@ -57,7 +58,8 @@ def heatmap_peaks(
         center_seed: ``voxel`` for the voxel's centre (the paper's), ``mean`` for the heat-weighted mean of the votes
             in the 3x3x3 voxels, which does not jump with the grid.
     """
-    heat, beaten, mean = _heatmap(votes, voxel_size, window)
+    with full_precision(votes.device):
+        heat, beaten, mean = _heatmap(votes, voxel_size, window)
     peak_heat, at = torch.topk(heat * (1.0 - beaten), min(count, votes.shape[1]), dim=1)
     seeds = mean if center_seed == "mean" else (torch.floor(votes / voxel_size) + 0.5) * voxel_size
     batch = torch.arange(len(votes), device=votes.device)[:, None]

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from attentionvote.geometry import native
 from attentionvote.model.layers import RowNorm, shared_mlp
 from attentionvote.model.pooled_mlp import pooled_mlp
+from attentionvote.model.precision import full_precision, widened
 from attentionvote.model.rotation import matrix_from_six
 
 CHANNELS = 6
@@ -143,11 +144,13 @@ class Refiner(nn.Module):
     ) -> Refined:
         """One correction; the given pose is taken as a measurement and gets no gradient."""
         center, rotation = center.detach(), rotation.detach()
-        seen = points_in_box(points, normals, sample, center, rotation, self.box, 2.0 / self.diameter, self.points)
+        with full_precision(points.device):
+            seen = points_in_box(points, normals, sample, center, rotation, self.box, 2.0 / self.diameter, self.points)
         nobody = torch.zeros(seen.shape[:2], dtype=torch.long, device=seen.device)
         pooled = torch.relu(self.norm(pooled_mlp(seen, None, nobody, list(self.weights))))
-        out = self.output(self.mlp(torch.cat([pooled, context], dim=-1)))
+        out = widened(self.output(self.mlp(torch.cat([pooled, context], dim=-1))))
         identity = torch.tensor([1.0, 0, 0, 0, 1.0, 0], device=out.device)
-        shift = (rotation @ out[:, :3, None])[..., 0] * (0.1 * self.diameter)
-        turn = matrix_from_six(identity + 0.3 * out[:, 3:9])
-        return Refined(center + shift, rotation @ turn, out[:, 9])
+        with full_precision(points.device):
+            shift = (rotation @ out[:, :3, None])[..., 0] * (0.1 * self.diameter)
+            turn = matrix_from_six(identity + 0.3 * out[:, 3:9])
+            return Refined(center + shift, rotation @ turn, out[:, 9])
