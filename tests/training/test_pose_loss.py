@@ -195,3 +195,12 @@ def test_moving_to_another_device_moves_everything(make_box: Callable) -> None:
     pose = SymmetricPose.of(make_box(Symmetry("revolution", flip=True))).to(torch.device("meta"))
     assert pose.axis is not None
     assert {t.device.type for t in (pose.group, pose.representation, pose.axis)} == {"meta"}
+
+
+def test_losses_are_computed_where_the_poses_are(symmetric_part: Part) -> None:
+    # The meta device refuses tensors of another device, as a GPU does.
+    pose, rotation = SymmetricPose.of(symmetric_part), torch.zeros(4, 3, 3, device="meta")
+    center = torch.zeros(4, 3, device="meta")
+    assert pose.distance(center, rotation, center, rotation).device.type == "meta"
+    kind = "slerp" if symmetric_part.symmetry.is_revolution else "metric"
+    assert pose.rotation_loss(kind, center.new_zeros(4, 4), rotation, rotation).device.type == "meta"

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from attentionvote.geometry.pose import canonical_quaternion, quaternion_from_matrix
+from attentionvote.model.precision import full_precision
 from attentionvote.part import Part
 
 RotationLoss = Literal["metric", "slerp", "minra", "nlerp"]
@@ -62,8 +63,10 @@ class SymmetricPose:
         self, predicted: Float[Tensor, "rows 3 3"], true: Float[Tensor, "rows 3 3"]
     ) -> Float[Tensor, " rows"]:
         """Square of the rotational distance in square metres, minimum over the symmetry group."""
-        aims = true[:, None] @ (self.group @ self.representation)
-        return (predicted[:, None] @ self.representation - aims).square().sum((-2, -1)).amin(1)
+        with full_precision(true.device):
+            own = self.to(true.device)
+            aims = true[:, None] @ (own.group @ own.representation)
+            return (predicted[:, None] @ own.representation - aims).square().sum((-2, -1)).amin(1)
 
     def distance(
         self,
@@ -91,16 +94,18 @@ class SymmetricPose:
             return (self.squared_turn(rotation, true) + (_TINY * self.diameter) ** 2).sqrt() / (0.1 * self.diameter)
         if kind not in get_args(RotationLoss):
             raise ValueError(f"rotation loss must be one of {', '.join(get_args(RotationLoss))}, got {kind!r}")
-        if self.axis is not None:
-            aims = torch.einsum("rij,gjk,k->rgi", true, self.group, self.axis)
-            axes = (rotation @ self.axis)[:, None]
-            return angle_between(axes, aims).amin(1)
+        own = self.to(true.device)
+        if own.axis is not None:
+            with full_precision(true.device):
+                aims = torch.einsum("rij,gjk,k->rgi", true, own.group, own.axis)
+                axes = (rotation @ own.axis)[:, None]
+                return angle_between(axes, aims).amin(1)
         return quaternion_loss(kind, quaternion[:, None], self._equivalents(true)).amin(1)
 
     def _equivalents(self, true: Tensor) -> Tensor:
         """Canonical quaternions ``(rows, G, 4)`` of the equivalent rotations: here, and only here, the sign that
         Eq. (6) depends on becomes part of the label."""
-        matrices = (true[:, None] @ self.group).detach().cpu().numpy()
+        matrices = true[:, None].detach().cpu().numpy() @ self.group.cpu().numpy()
         quaternions = canonical_quaternion(quaternion_from_matrix(matrices))
         return torch.from_numpy(quaternions.astype(np.float32)).to(true.device)
 
