@@ -18,7 +18,7 @@ def scene_results(
     Args:
         predictions: of the batch.
         batch: with the truth; padded instances (visibility 0 at an identity pose at the origin) are left out.
-        peak_threshold: proposals with less heat are dropped (the paper's 0.4).
+        peak_threshold: proposals with less heat are dropped (the paper's 0.4), and places without a peak (heat 0).
         confidence_threshold: proposals with less confidence are dropped.
     """
     results = []
@@ -26,7 +26,7 @@ def scene_results(
     heat, confidence = predictions.peak_heat.float().cpu().numpy(), predictions.confidence.float().cpu().numpy()
     rotation = matrix_from_quaternion(predictions.quaternion.double().cpu().numpy())
     poses = transform(rotation, predictions.center.double().cpu().numpy())
-    kept = (heat >= peak_threshold) & (confidence >= confidence_threshold) & (confidence > 0)  # 0 = merged
+    kept = (heat >= peak_threshold) & (heat > 0) & (confidence >= confidence_threshold) & (confidence > 0)  # 0 = merged
     truth = transform(batch.rotation.double().cpu().numpy(), batch.center.double().cpu().numpy())
     real = (batch.center.abs().sum(-1) > 0).cpu().numpy()
     visible = batch.visible.double().cpu().numpy()

@@ -183,14 +183,15 @@ def batch_loss(
 
     Args:
         ramp: 0 during the warm-up, when only the votes are trained; the proposals are then not computed at all.
-        least_heat: proposals with less heat are left out of training.
+        least_heat: proposals with less heat are left out of training; so are places beyond the last peak (heat 0).
     """
     votes = model.cast_votes(batch.points, batch.normals, batch.found)
     terms = loss.vote_terms(votes, batch)
     if ramp <= 0:
         return terms
     peaks = model.find_peaks(votes)
-    rows = torch.nonzero(peaks.heat.flatten() >= least_heat)[:, 0]
+    heat = peaks.heat.flatten()
+    rows = torch.nonzero((heat >= least_heat) & (heat > 0))[:, 0]
     stride = -(-len(rows) // (loss.settings.rows_per_scene * len(batch.points)))
     if stride > 1:  # which ones is as good as random, and the same in a continued training
         rows = rows[int(rows.sum()) % stride :: stride]
