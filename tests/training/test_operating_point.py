@@ -38,6 +38,12 @@ def test_the_threshold_leaves_out_the_wrong_ones_and_is_the_lowest_that_does(
     assert [len(s.gt_poses) for s in kept] == [2, 1, 0, 1]
 
 
+def test_confidences_beyond_one_are_searched_where_they_lie(make_box: Callable) -> None:
+    # Eq. 10 has confidences of any size: everything right above 4, everything wrong below.
+    many = [scene([0.001, 0.4], [4.0 + i, 3.9 - i / 10], [0.0]) for i in range(5)]
+    assert 3.9 < best_threshold(many, make_box()) <= 4.0
+
+
 def test_it_has_the_best_f1_of_all(make_box: Callable) -> None:
     rng = np.random.default_rng(0)
     many = []

@@ -12,6 +12,14 @@ from attentionvote.part import Part
 THRESHOLDS = tuple(np.round(np.linspace(0.0, 0.9, 37), 3))
 
 
+def candidates(scenes: Sequence[SceneResult]) -> tuple[float, ...]:
+    """Thresholds worth trying: ``THRESHOLDS``, or as many quantiles where confidences go beyond 1 (Eq. 10)."""
+    scores = np.concatenate([np.zeros(1), *(scene.scores for scene in scenes)])
+    if scores.max() <= 1:
+        return THRESHOLDS
+    return (0.0, *np.unique(np.quantile(scores[1:], np.linspace(0, 1, len(THRESHOLDS) - 1))))
+
+
 def confident(scenes: Sequence[SceneResult], threshold: float) -> list[SceneResult]:
     """The same scenes with only the detections of at least this confidence."""
     kept = [scene.scores >= threshold for scene in scenes]
@@ -26,7 +34,7 @@ def best_threshold(scenes: Sequence[SceneResult], part: Part, fraction: float = 
     """
     metric = PoseMetric.of(part)
     best, best_f1 = 0.0, -1.0
-    for threshold in THRESHOLDS:
+    for threshold in candidates(scenes):
         right = wrong = missed = 0
         for scene in confident(scenes, threshold):
             distances = metric.distances(scene.poses, scene.gt_poses)
