@@ -8,13 +8,12 @@ Interrupted, also by kill -9, it goes on where it was. What exists is not genera
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 import time
 from pathlib import Path
 from typing import Any
 
-from command import ConfigurationError, command, configuring
+from command import ConfigurationError, command, configuring, cores
 from omegaconf import DictConfig, OmegaConf
 
 log = logging.getLogger("attentionvote.generate")
@@ -39,7 +38,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         directory = scene_set_directory(Path(cfg.root), part.name, specs[split])
         if cfg.force and directory.exists():
             shutil.rmtree(directory)
-        scenes = generate_scene_set(part, specs[split], directory, cfg.workers or os.cpu_count() or 1)
+        scenes = generate_scene_set(part, specs[split], directory, cfg.workers or cores())
         log.info("%s: %d scenes of %d cycles in %s", split, len(scenes), scenes.cycles, directory)
         sets[split] = {
             "directory": str(directory),

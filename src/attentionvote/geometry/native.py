@@ -26,7 +26,8 @@ PORTABLE = ("-O3", "-std=gnu99", "-ffinite-math-only", "-fno-signed-zeros", "-sh
 
 @functools.cache
 def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
-    """The compiled library of a C file that lies in a package, or None (with one warning) without a C compiler.
+    """The compiled library of a C file that lies in a package, or None (with one warning) without a C compiler or
+    a place to keep it.
 
     Args:
         package: dotted name of the package.
@@ -42,6 +43,12 @@ def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
     key = hashlib.sha256("\0".join([source.decode(), *flags, machine]).encode()).hexdigest()
     path = cache_folder() / f"{Path(file).stem}-{key[:16]}.so"
     if not path.exists():
+        if not _writable(path.parent):
+            warnings.warn(
+                f"{path.parent} cannot be written, {file} is replaced by slow Python: set ATTENTIONVOTE_CACHE",
+                stacklevel=2,
+            )
+            return None
         compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
         if compiler is None:
             warnings.warn(f"no C compiler found, {file} is replaced by slow Python: install gcc", stacklevel=2)
@@ -88,8 +95,15 @@ def _processor() -> str:
     return "\n".join(line for line in lines if line.startswith(("model name", "flags", "Features")))
 
 
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
+
+
 def _compile(compiler: str, flags: tuple[str, ...], source: bytes, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         c_file, library = Path(folder, "source.c"), Path(folder, "library.so")
         c_file.write_bytes(source)

@@ -1,0 +1,65 @@
+"""Compiling and loading the C files: what happens on machines where that cannot be done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from attentionvote.geometry import native
+
+
+@pytest.fixture
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A machine on which nothing has been compiled yet."""
+    monkeypatch.setenv("ATTENTIONVOTE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("CC", raising=False)
+    native.load.cache_clear()
+    yield tmp_path / "cache"
+    native.load.cache_clear()
+
+
+def test_a_library_is_compiled_once_and_kept(empty_cache: Path) -> None:
+    if native.shutil.which("cc") is None:
+        pytest.skip("no C compiler on this machine")
+    assert native.load("attentionvote.geometry", "pointops.c") is not None
+    (kept,) = empty_cache.glob("pointops-*.so")
+    changed = kept.stat().st_mtime_ns
+    native.load.cache_clear()
+    assert native.load("attentionvote.geometry", "pointops.c") is not None
+    assert kept.stat().st_mtime_ns == changed
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_without_a_compiler_there_is_no_library_and_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native.shutil, "which", lambda _: None)
+    with pytest.warns(UserWarning, match=r"no C compiler found, pointops\.c is replaced by slow Python: install gcc"):
+        assert native.load("attentionvote.geometry", "pointops.c") is None
+    assert native.load("attentionvote.geometry", "pointops.c") is None  # remembered, no second warning
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_without_a_place_to_keep_it_there_is_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ATTENTIONVOTE_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.warns(UserWarning, match="cannot be written.*set ATTENTIONVOTE_CACHE"):
+        assert native.load("attentionvote.geometry", "pointops.c") is None
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_a_refused_file_is_reported_in_the_compilers_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(OSError, match="false could not compile pointops"):
+        native.load("attentionvote.geometry", "pointops.c")
+
+
+def test_a_function_without_memory_raises() -> None:
+    class Failing:
+        __name__ = "ball_query"
+
+        def __call__(self, *_: object) -> int:
+            return 1
+
+    with pytest.raises(MemoryError, match="ball_query ran out of memory"):
+        native.call(Failing())
