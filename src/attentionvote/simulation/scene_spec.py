@@ -39,7 +39,7 @@ class SceneSetSpec:
     split: str
     cycles: int
     seed: int = 0
-    drop_counts: tuple[int, ...] = (6, 10, 14, 18, 22, 26, 30)
+    drop_counts: tuple[int, ...] = (6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30)
     bin: BinSettings = field(default_factory=BinSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     drop: DropSettings = field(default_factory=DropSettings)
