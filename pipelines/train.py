@@ -10,6 +10,8 @@ is complete is not repeated without force=true.
 from __future__ import annotations
 
 import logging
+import os
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,8 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     with job.locked():
         result = job.result
         if result is not None and cfg.resume != "never" and not cfg.force:
-            log.info("this training is complete (force=true repeats it): %s", job.directory)
+            commit = str(result.get("commit", "unknown"))[:12]
+            log.info("this training is complete, made at commit %s (force=true repeats it): %s", commit, job.directory)
             return result
         from training_run import TrainingRun
 
@@ -40,11 +43,19 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 def preset_of_hardware(words: list[str]) -> list[str]:
-    """``experiment=gpu`` where an NVIDIA driver is loaded, else ``experiment=compact``, unless the user named one."""
+    """``experiment=gpu`` where torch can use a GPU, else ``experiment=compact``, unless the user named one.
+
+    Told without importing torch: an NVIDIA driver is loaded, not hidden from us, and torch is no CPU build.
+    """
     if any(word.lstrip("+~").startswith("experiment") for word in words):
         return []
-    gpu = Path("/proc/driver/nvidia/version").exists()
-    preset, reason = ("gpu", "an NVIDIA driver was found") if gpu else ("compact", "no GPU was found")
+    preset, reason = "compact", "no GPU was found"
+    if Path("/proc/driver/nvidia/version").exists():
+        preset, reason = "gpu", "a GPU was found"
+        if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+            preset, reason = "compact", "CUDA_VISIBLE_DEVICES hides the GPU"
+        elif version("torch").endswith("+cpu"):
+            preset, reason = "compact", "torch is a CPU build"
     log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
     return [f"experiment={preset}"]
 

@@ -111,6 +111,22 @@ def _check(cfg: DictConfig, specs: dict[str, SceneSetSpec]) -> None:
         raise ValueError(
             f"trainer.batch_size must be at most the {scenes} training scenes, got {cfg.trainer.batch_size}"
         )
+    steps = scenes // cfg.trainer.batch_size * cfg.trainer.max_epochs
+    if cfg.trainer.schedule.vote_steps >= steps:
+        raise ValueError(
+            f"trainer.schedule.vote_steps must be less than the {steps} steps of the training, or no pose is ever "
+            f"trained; got {cfg.trainer.schedule.vote_steps}"
+        )
+    if cfg.model.refinement is not None and cfg.model.refinement_steps:
+        if not cfg.loss.weights.get("refined", 0) > 0:
+            raise ValueError(
+                "loss.weights.refined must be greater than 0 with model.refinement, got 0: set one of them"
+            )
+        if cfg.model.confidence != "quality":
+            raise ValueError(
+                "model.confidence must be quality with model.refinement, whose scores Eq. 10 does not train; got "
+                f"{cfg.model.confidence}: set model.refinement=null"
+            )
     if cfg.data.pool > cfg.data.density:
         raise ValueError(f"data.pool must be at most data.density ({cfg.data.density}), got {cfg.data.pool}")
     if cfg.data.points < cfg.model.centers[0]:

@@ -108,7 +108,9 @@ def log_losses(tracked: Any) -> dict[str, list[float]]:
     for name, (_, values) in terms.items():
         count = max(1, len(values) // 10)
         ends[name] = [round(sum(part) / count, 4) for part in (values[:count], values[-count:])]
-    if len(terms.get("vote", ([], []))[1]) >= _LEAST_HISTORY and not ends["vote"][1] < ends["vote"][0]:
+    steps = terms.get("vote", ([], []))[0]
+    whole = len(steps) >= _LEAST_HISTORY and steps[0] * 4 < steps[-1]  # not only the end, after a lost run
+    if whole and not ends["vote"][1] < ends["vote"][0]:
         first, last = ends["vote"]
         raise ValueError(
             f"the loss of the votes must fall in a training, but it went from {first:g} to {last:g}: "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 import warnings
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from command import cores
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -26,6 +26,7 @@ from attentionvote import __version__
 from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule, measure_clouds
 from attentionvote.model import AttentionVote
 from attentionvote.simulation import Sensor, generate_scene_set, scene_set_directory
+from attentionvote.tracking.provenance import git_state
 from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
 from attentionvote.training.checkpoint import FORMAT, AtomicCheckpoints, usable_checkpoint
 from attentionvote.training.pictures import ScenePictures
@@ -56,7 +57,7 @@ class TrainingRun:
         self.cfg, self.job, self.part = cfg, job, job.part
         part, t = job.part, cfg.trainer
         L.seed_everything(cfg.seed, verbose=False)
-        self.threads = t.threads or os.cpu_count() or 1
+        self.threads = t.threads or cores()
         torch.set_num_threads(self.threads)
         box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
         arguments = OmegaConf.to_container(cfg.model, resolve=True)
@@ -98,7 +99,7 @@ class TrainingRun:
             json.loads(json.dumps(metadata)),  # plain values only: what torch.load(weights_only=True) accepts
         )
         self.augmentation = Augmentation(**cfg.data.augmentation)
-        self.workers = cfg.workers or os.cpu_count() or 1
+        self.workers = cfg.workers or cores()
         with _quiet():
             self.trainer = self._trainer()
 
@@ -130,6 +131,7 @@ class TrainingRun:
                     "data_seconds": round(data_seconds, 1),
                     "train_seconds": round(progress.seconds, 1),
                     "seconds": round(time.monotonic() - start, 1),
+                    "commit": git_state(Path.cwd()).commit,
                 }
                 tracked.log_text("result.json", json.dumps(result, indent=2))
                 write_json(self.job.directory / RESULT, result)

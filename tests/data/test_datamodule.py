@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -41,6 +42,19 @@ def test_a_loader_process_changes_nothing_over_epochs(clouds: Clouds, layout: La
         loader.sampler.set_epoch(epoch)
         drawn = [batch.points for batch in loader]
         assert all(torch.equal(a, b) for a, b in zip(drawn, points(own, epoch), strict=True))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_continued_training_begins_with_its_own_epoch(clouds: Clouds, layout: Layout, workers: int) -> None:
+    data = module(clouds, layout, workers)
+    progress = SimpleNamespace(current=SimpleNamespace(processed=3))
+    data.trainer = SimpleNamespace(fit_loop=SimpleNamespace(epoch_progress=progress))  # type: ignore[assignment]
+    loader = data.train_dataloader()
+    batches = iter(loader)  # Lightning opens the loader before it tells the epoch
+    assert isinstance(loader.sampler, EpochSampler)
+    loader.sampler.set_epoch(3)
+    drawn = [batch.points for batch in batches]
+    assert all(torch.equal(a, b) for a, b in zip(drawn, points(module(clouds, layout), 3), strict=True))
 
 
 def test_every_scene_occurs_once_an_epoch() -> None:

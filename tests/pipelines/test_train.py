@@ -40,7 +40,8 @@ TINY = [
     "object=brick", "experiment=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2]", "workers=1",
     "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=6",
     "trainer.validate_every=2", "trainer.threads=1", "trainer.average_decay=0.5", "trainer.precision=32-true",
-    "trainer.accelerator=cpu", "tracking.system_interval=0", *NETWORK,
+    "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1", "trainer.schedule.ramp_steps=1",
+    "tracking.system_interval=0", *NETWORK,
 ]  # fmt: skip
 
 
@@ -166,6 +167,9 @@ def test_impossible_requests_end_at_once_with_one_sentence(
 
 def test_impossible_networks_and_devices_are_refused_before_generation(words: list[str], tmp_path: Path) -> None:
     for more, message in (
+        ("trainer.schedule.vote_steps=12", "vote_steps must be less than the 12 steps of the training, or no pose"),
+        ("loss.weights.refined=0.0", "loss.weights.refined must be greater than 0 with model.refinement"),
+        ("model.confidence=exponential", "model.confidence must be quality with model.refinement.*refinement=null"),
         ("model.centers=[64,80,16,8]", "centers must fall from level to level"),
         ("trainer.accelerator=gpu", "trainer settings cannot be met: .*gpu"),
         ("trainer.schedule.milestones=[5,2]", "milestones must be rising"),

@@ -191,6 +191,9 @@ def create_arrays(directory: Path, scenes: int, pool: int) -> None:
     for name, (shape, dtype) in shapes.items():
         temporary = directory / f".{name}.npy.{os.getpid()}"
         np.lib.format.open_memmap(temporary, mode="w+", dtype=dtype, shape=shape).flush()
+        # A sparse file would meet a full disk while it is written through the mapping, which kills the process.
+        with temporary.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, temporary.stat().st_size)
         temporary.replace(directory / f"{name}.npy")
 
 

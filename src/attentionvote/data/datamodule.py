@@ -98,10 +98,15 @@ class PartDataModule(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Shuffled, augmented, full batches only."""
+        sampler = EpochSampler(len(self.train), self.seed)
+        if self.trainer is not None:
+            # Lightning tells the sampler the epoch only after it has opened the loader, whose processes fetch ahead:
+            # a continued training would see the samples of epoch 0 again.
+            sampler.set_epoch(self.trainer.fit_loop.epoch_progress.current.processed)
         return DataLoader(
             self.train,
             batch_size=self.batch_size,
-            sampler=EpochSampler(len(self.train), self.seed),
+            sampler=sampler,
             collate_fn=collate,
             num_workers=self.workers,
             persistent_workers=self.workers > 0,

@@ -84,13 +84,6 @@ class PoseTraining(L.LightningModule):
         for name in ("ap_10", "ap_5", "ap_2"):
             self.log(name, metrics[name], prog_bar=True, logger=False)
 
-    on_test_epoch_start = on_validation_epoch_start
-    test_step = validation_step
-
-    def on_test_epoch_end(self) -> None:
-        """All figures of the test scenes."""
-        self.log_dict({f"test/{k}": v for k, v in evaluate(self.results, self.part).items()})
-
     @torch.no_grad()
     def detect(self, batch: Batch) -> list[SceneResult]:
         """Detections of a batch beside its truth; inference looks at votes within the test radius."""
