@@ -46,9 +46,10 @@ def test_a_loader_process_changes_nothing_over_epochs(clouds: Clouds, layout: La
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_continued_training_begins_with_its_own_epoch(clouds: Clouds, layout: Layout, workers: int) -> None:
-    data = module(clouds, layout, workers)
+    interrupted, data = module(clouds, layout), module(clouds, layout, workers)
     progress = SimpleNamespace(current=SimpleNamespace(processed=3))
-    data.trainer = SimpleNamespace(fit_loop=SimpleNamespace(epoch_progress=progress))  # type: ignore[assignment]
+    interrupted.trainer = SimpleNamespace(fit_loop=SimpleNamespace(epoch_progress=progress))  # type: ignore[assignment]
+    data.load_state_dict(interrupted.state_dict())
     loader = data.train_dataloader()
     batches = iter(loader)  # Lightning opens the loader before it tells the epoch
     assert isinstance(loader.sampler, EpochSampler)

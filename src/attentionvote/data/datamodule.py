@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -95,14 +96,14 @@ class PartDataModule(L.LightningDataModule):
         if len(self.train) < batch_size:
             raise ValueError(f"batch_size must be at most the {len(self.train)} training scenes, got {batch_size}")
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
+        self.first_epoch = 0
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Shuffled, augmented, full batches only."""
         sampler = EpochSampler(len(self.train), self.seed)
-        if self.trainer is not None:
-            # Lightning tells the sampler the epoch only after it has opened the loader, whose processes fetch ahead:
-            # a continued training would see the samples of epoch 0 again.
-            sampler.set_epoch(self.trainer.fit_loop.epoch_progress.current.processed)
+        # Lightning opens the loader, whose processes fetch ahead, before it tells the sampler the epoch: without this a
+        # continued training would see the samples of epoch 0 again.
+        sampler.set_epoch(self.first_epoch)
         return DataLoader(
             self.train,
             batch_size=self.batch_size,
@@ -121,6 +122,15 @@ class PartDataModule(L.LightningDataModule):
     def test_dataloader(self) -> DataLoader[Batch]:
         """The test scenes, always the same samples."""
         return self._plain(self.test)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The epoch with which a continued training begins, kept in every checkpoint."""
+        assert self.trainer is not None
+        return {"epoch": int(self.trainer.fit_loop.epoch_progress.current.processed)}  # type: ignore[attr-defined]
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Begin there; Lightning calls it before it opens a loader."""
+        self.first_epoch = int(state_dict["epoch"])
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Neighbourhoods are nested tuples, which Lightning would rebuild as lists."""
