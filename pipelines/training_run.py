@@ -224,6 +224,7 @@ class TrainingRun:
         last = ModelCheckpoint(folder, "last", enable_version_counter=False, save_on_train_epoch_end=True)
         self.progress = TrainingProgress()
         self.pictures = ScenePictures()
+        self.checkpoint_files = AtomicCheckpoints()
         callbacks: list[Callback] = [best, last, self.progress, self.pictures]
         if t.average_decay:
             callbacks.append(EMAWeightAveraging(decay=t.average_decay, use_buffers=True))
@@ -245,7 +246,7 @@ class TrainingRun:
             num_sanity_val_steps=0,
             logger=False,
             callbacks=callbacks,
-            plugins=[AtomicCheckpoints()],
+            plugins=[self.checkpoint_files],
             enable_progress_bar=False,
             enable_model_summary=False,
             default_root_dir=self.job.directory,
@@ -261,6 +262,7 @@ class TrainingRun:
             tracked.log_figure(f"val/scene_{scene}.png", scene_picture(**inputs, title=title), step)
 
         self.pictures.draw = draw
+        self.checkpoint_files.before_save = tracked.flush_metrics
         shapes = {name: value.shape for name, value in self.module.state_dict().items()}
         start = usable_checkpoint([self._checkpoints / "last.ckpt", self._checkpoints / "best.ckpt"], shapes)
         trainer = self.trainer

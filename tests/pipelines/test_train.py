@@ -345,10 +345,10 @@ def test_killed_anywhere_and_continued_ends_the_same(words: list[str], tmp_path:
     ends = [torch.load(Path(r["checkpoint"]).with_name("last.ckpt"), weights_only=True) for r in (whole, result)]
     for key in ("state_dict", "current_model_state"):
         assert all(torch.equal(a, ends[1][key][name]) for name, a in ends[0][key].items())
-    histories = [
-        tracking.start_run(store, run_id=r["run_id"], system_interval_s=0).metric_history("train/loss/vote")
-        for r in (whole, result)
-    ]
+    histories = []
+    for r in (whole, result):
+        with tracking.start_run(store, run_id=r["run_id"], system_interval_s=0) as tracked:
+            histories.append(tracked.metric_history("train/loss/vote"))
     assert histories[0] == histories[1]  # one unbroken curve
 
 

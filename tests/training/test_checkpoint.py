@@ -78,6 +78,12 @@ def test_a_checkpoint_of_lightning_s_is_read_as_well(tmp_path: Path, model: Atte
     weights = {f"model.{k}": v for k, v in model.state_dict().items()}
     content = {KEY: METADATA, "state_dict": weights, "epoch": 3, "optimizer_states": [{"step": 2}]}
     AtomicCheckpoints().save_checkpoint(content, tmp_path / "new" / "last.ckpt")
+    called = []
+    AtomicCheckpoints(lambda: called.append((tmp_path / "new" / "other.ckpt").exists())).save_checkpoint(
+        content, tmp_path / "new" / "other.ckpt"
+    )
+    assert called == [False]
+    (tmp_path / "new" / "other.ckpt").unlink()
     again, _ = load_trained(str(tmp_path / "new" / "last.ckpt"))
     assert all(torch.equal(a, b) for a, b in zip(model.parameters(), again.parameters(), strict=True))
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["last.ckpt"]
