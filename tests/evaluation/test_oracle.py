@@ -1,7 +1,7 @@
 """Exact against the benchmark's toolbox: its bunny sample, and random poses of four symmetry classes scored by it.
 
 The data lie beside the repository (../shared/data) and are never committed; without them these tests skip.
-Expected figures of the bunny sample: ../shared/reference/formats-and-metrics.md, section 2a.
+Expected figures of the bunny sample: made with the published toolbox (its repository at c726dff9).
 """
 
 from __future__ import annotations
