@@ -28,7 +28,7 @@ from configuration import CONF, ConfigurationError, choices, compose, leaves, se
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 
-__all__ = ["ConfigurationError", "command", "configuring", "cores"]
+__all__ = ["ConfigurationError", "command", "configuring"]
 
 Run = Callable[[DictConfig], dict[str, Any]]
 Defaults = Callable[[list[str]], list[str]]
@@ -83,17 +83,6 @@ def configuring(what: str = "") -> Iterator[None]:
         raise
     except (ValueError, TypeError, OSError) as error:
         raise ConfigurationError(_prefixed(what, error)) from error
-
-
-def cores() -> int:
-    """Processor cores this process may use: of its cpuset, and of its container's quota (at least one)."""
-    count = len(os.sched_getaffinity(0))
-    try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        count = min(count, int(quota) // int(period))
-    except (OSError, ValueError):  # no such file, or no quota ("max")
-        pass
-    return max(1, count)
 
 
 def _prefixed(what: str, error: BaseException) -> str:

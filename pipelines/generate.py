@@ -13,7 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from command import ConfigurationError, command, configuring, cores
+from command import ConfigurationError, command, configuring
+from hardware import cores
 from omegaconf import DictConfig, OmegaConf
 
 log = logging.getLogger("attentionvote.generate")

@@ -5,21 +5,19 @@ from __future__ import annotations
 import json
 import logging
 import time
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from command import cores
+from hardware import cores
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from training_job import MODEL, RESULT, RUN, TrainingJob, write_json
+from training_messages import plain_loader_errors, quiet_lightning
 from training_results import assess, log_losses
 
 from attentionvote import __version__
@@ -34,16 +32,6 @@ from attentionvote.training.progress import TrainingProgress
 
 log = logging.getLogger("attentionvote.train")
 _CYCLES_PER_PROCESS = 5
-# Advice of Lightning and torch that does not fit: loaders cost a few milliseconds a sample, a continued training finds
-# its own checkpoints, and the rest is between Lightning and torch.
-_CHATTER = (
-    ".*does not have many workers.*",
-    ".*exists and is not empty.*",
-    ".*treespec, LeafSpec.*",
-    ".*LeafSpec.*is deprecated.*",
-    ".*The number of training batches .* is smaller than the logging interval.*",
-    ".*`ModelCheckpoint.monitor=.*could not find the monitored key.*",
-)
 
 
 class TrainingRun:
@@ -100,7 +88,7 @@ class TrainingRun:
         )
         self.augmentation = Augmentation(**cfg.data.augmentation)
         self.workers = cfg.workers or cores()
-        with _quiet():
+        with quiet_lightning():
             self.trainer = self._trainer()
 
     def run(self) -> dict[str, Any]:
@@ -109,7 +97,7 @@ class TrainingRun:
         self._introduce()
         clouds = self._measure()
         data_seconds = time.monotonic() - start
-        with _plain_loader_errors(), _quiet():
+        with plain_loader_errors(), quiet_lightning():
             data = self._data_module(clouds)
             with self._open_tracking(clouds) as tracked:
                 progress = self._fit(data, tracked)
@@ -276,26 +264,3 @@ class TrainingRun:
         if self.cfg.trainer.precision != "auto":
             return self.cfg.trainer.precision
         return "bf16-mixed" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "32-true"
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Lightning's banners and advice stay out of the way of what matters."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
-    with warnings.catch_warnings():
-        for message in _CHATTER:
-            warnings.filterwarnings("ignore", message)
-        yield
-
-
-@contextmanager
-def _plain_loader_errors() -> Iterator[None]:
-    """What fails in a loader process arrives with its traceback as message: only its last line is for people."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        text = str(error)
-        if not text.startswith("Caught "):
-            raise
-        raise type(error)(text.strip().splitlines()[-1].partition(": ")[2]) from error

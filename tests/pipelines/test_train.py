@@ -41,7 +41,7 @@ TINY = [
     "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=6",
     "trainer.validate_every=2", "trainer.threads=1", "trainer.average_decay=0.5", "trainer.precision=32-true",
     "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1", "trainer.schedule.ramp_steps=1",
-    "tracking.system_interval=0", *NETWORK,
+    "tracking.system_interval=0", "force=false", *NETWORK,
 ]  # fmt: skip
 
 
@@ -220,7 +220,7 @@ def test_the_whole_chain(
     caplog.clear()
     with caplog.at_level(logging.INFO, logger="attentionvote"):
         assert run(words) == result
-    assert "is complete (force=true repeats it)" in caplog.text
+    assert "is complete, made at commit " in caplog.text
     assert run(words, "data.workers=1", "trainer.threads=2") == result  # what is learned does not depend on them
     # The model is gone: only the test is done again, in the same run.
     request.getfixturevalue("cheap_figures")
