@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Sequence
 
 import torch
@@ -13,7 +11,7 @@ from torch import Tensor, nn
 from attentionvote.model.layers import Residual, RowNorm, shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods
 from attentionvote.model.point_features import CHANNELS, pair_features
-from attentionvote.model.pooled_mlp import pooled_mlp
+from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_weights
 
 
 class SetAbstraction(nn.Module):
@@ -34,10 +32,7 @@ class SetAbstraction(nn.Module):
         super().__init__()
         self.radius = radius
         self.project = nn.Linear(width_in, widths[0], bias=False) if width_in else None
-        sizes = [CHANNELS, *widths]
-        self.weights = nn.ParameterList()
-        for a, b in itertools.pairwise(sizes):
-            self.weights += [torch.randn(b, a) * math.sqrt(2.0 / a), torch.zeros(b)]
+        self.weights = pooled_mlp_weights(CHANNELS, widths)
         self.norm = RowNorm(widths[-1])
         self.residual = Residual(widths[-1]) if residual else nn.Identity()
 

@@ -70,7 +70,7 @@ class Predictions(NamedTuple):
         center: ``(batch, K, 3)`` metres.
         quaternion: ``(batch, K, 4)`` unit, w first.
         class_logits: ``(batch, K, classes)``.
-        confidence: ``(batch, K)``, positive; higher is better.
+        confidence: ``(batch, K)``, higher is better; 0 for a proposal that was merged into another.
     """
 
     vote_xyz: Tensor

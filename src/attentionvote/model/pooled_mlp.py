@@ -8,15 +8,17 @@ the backward pass, and uses that the maximum passes its gradient to one neighbou
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from attentionvote.geometry import native
 
@@ -64,11 +66,23 @@ def pooled_mlp(
     # The kernel reads raw memory: under autocast only the projection would be of half precision.
     plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs)
     plain = plain and not torch.compiler.is_compiling()
-    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if fits and plain else None
+    library = _kernels() if fits and plain else None
     if library is None:
         return pooled_mlp_reference(geometry, projected, index, weights)
     result: Tensor = _PooledMLP.apply(geometry.detach(), projected, index.long(), *weights)
     return result
+
+
+def pooled_mlp_weights(channels: int, widths: Sequence[int]) -> nn.ParameterList:
+    """Fresh weights of ``pooled_mlp``: W1, b1, W2, b2 ... from ``channels`` to each of ``widths`` (He et al. 2015)."""
+    weights = nn.ParameterList()
+    for a, b in pairwise([channels, *widths]):
+        weights += [torch.randn(b, a) * math.sqrt(2.0 / a), torch.zeros(b)]
+    return weights
+
+
+def _kernels() -> ctypes.CDLL | None:
+    return native.load("attentionvote.model", "network_ops.c", tuned=True)
 
 
 class _PooledMLP(torch.autograd.Function):
@@ -80,7 +94,7 @@ class _PooledMLP(torch.autograd.Function):
         out = geometry.new_empty(centers, weights[-1].shape[0])
         winner = torch.empty(out.shape, dtype=torch.uint8)
         arguments = _arguments(geometry, projected, index, weights)
-        library = native.load("attentionvote.model", "network_ops.c", tuned=True)
+        library = _kernels()
         assert library is not None
         _in_threads(
             centers,
@@ -94,9 +108,9 @@ class _PooledMLP(torch.autograd.Function):
         geometry, projected, index, winner, *weights = ctx.saved_tensors
         grad_out = gradients[0].contiguous()
         arguments = _arguments(geometry, projected, index, weights)
-        library = native.load("attentionvote.model", "network_ops.c", tuned=True)
+        library = _kernels()
         assert library is not None
-        transposed = _pointers([w.detach().contiguous() for w in weights[0::2]])
+        transposed = _Pointers([w.detach().contiguous() for w in weights[0::2]])
         partial: list[tuple[list[Tensor], Tensor | None]] = []
         for _ in range(_thread_count(len(geometry))):
             # Narrow inputs: the first layer's gradient is gathered as (in, out) rows.
@@ -111,8 +125,8 @@ class _PooledMLP(torch.autograd.Function):
                 transposed.array,
                 winner.numpy(),
                 grad_out.numpy(),
-                _pointers(sums[0::2]).array,
-                _pointers(sums[1::2]).array,
+                _Pointers(sums[0::2]).array,
+                _Pointers(sums[1::2]).array,
                 None if grad_projected is None else grad_projected.numpy(),
             )
 
@@ -134,17 +148,13 @@ class _Pointers:
         self.array = (ctypes.c_void_p * len(tensors))(*(t.data_ptr() for t in tensors))
 
 
-def _pointers(tensors: list[Tensor]) -> _Pointers:
-    return _Pointers(tensors)
-
-
 def _arguments(
     geometry: Tensor, projected: Tensor | None, index: Tensor, weights: Sequence[Tensor]
 ) -> Callable[[int, int], tuple[object, ...]]:
     """The arguments that forward and backward share, for a range of centres."""
     widths = np.array([b.shape[0] for b in weights[1::2]], dtype=np.int32)
-    rows = _pointers([w.detach().T.contiguous() for w in weights[0::2]])
-    biases = _pointers([b.detach().contiguous() for b in weights[1::2]])
+    rows = _Pointers([w.detach().T.contiguous() for w in weights[0::2]])
+    biases = _Pointers([b.detach().contiguous() for b in weights[1::2]])
     _, neighbors, channels = geometry.shape
     source = None if projected is None else projected.detach().numpy()
 

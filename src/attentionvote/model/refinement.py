@@ -11,7 +11,6 @@ paper's form.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 
 from attentionvote.geometry import native
 from attentionvote.model.layers import RowNorm, shared_mlp
-from attentionvote.model.pooled_mlp import pooled_mlp
+from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_weights
 from attentionvote.model.precision import full_precision, widened
 from attentionvote.model.rotation import matrix_from_six
 
@@ -123,10 +122,7 @@ class Refiner(nn.Module):
         corners = torch.tensor(box, dtype=torch.float32) + torch.tensor([[-margin], [margin]])
         self.box: Tensor
         self.register_buffer("box", corners)
-        sizes = [CHANNELS, *widths]
-        self.weights = nn.ParameterList()
-        for a, b in itertools.pairwise(sizes):
-            self.weights += [torch.randn(b, a) * (2.0 / a) ** 0.5, torch.zeros(b)]
+        self.weights = pooled_mlp_weights(CHANNELS, widths)
         self.norm = RowNorm(widths[-1])
         self.mlp = shared_mlp(widths[-1] + context, head)
         self.output = nn.Linear(head[-1], 10)

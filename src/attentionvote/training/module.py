@@ -65,7 +65,6 @@ class PoseTraining(L.LightningModule):
             {f"train/loss/{k}": v.detach() for k, v in terms.items()} | {"train/loss": total.detach()},
             batch_size=len(batch.points),
         )
-        self.log("vote", terms["vote"].detach(), prog_bar=True, logger=False, batch_size=len(batch.points))
         return total
 
     def on_validation_epoch_start(self) -> None:
@@ -81,8 +80,6 @@ class PoseTraining(L.LightningModule):
         metrics = evaluate(self.results, self.part, add=False)
         self.log_dict({f"val/{k}": v for k, v in metrics.items()})
         self.log("val/ap", (metrics["ap_10"] + metrics["ap_5"] + metrics["ap_2"]) / 3)
-        for name in ("ap_10", "ap_5", "ap_2"):
-            self.log(name, metrics[name], prog_bar=True, logger=False)
 
     @torch.no_grad()
     def detect(self, batch: Batch) -> list[SceneResult]:
