@@ -1,0 +1,144 @@
+"""What an estimator answers: poses, or an abstention with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.contract import FRAME, UNITS, ModelCard
+from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix, transform
+
+Reason = Literal["too_few_points", "nothing_found", "deadline_exceeded"]
+DIGEST_LENGTH = 12
+
+
+class Detection(NamedTuple):
+    """One part that was found.
+
+    Attributes:
+        camera_from_part: ``(4, 4)`` float64.
+        confidence: the network's own measure of the pose.
+        part: name of its class.
+        heat: of the peak it comes from: how many votes agree on it.
+    """
+
+    camera_from_part: NDArray[np.float64]
+    confidence: float
+    part: str
+    heat: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: the pose as matrix, and as position (metres) and quaternion (w, x, y, z)."""
+        return {
+            "camera_from_part": self.camera_from_part.tolist(),
+            "position": self.camera_from_part[:3, 3].tolist(),
+            "quaternion": quaternion_from_matrix(self.camera_from_part[:3, :3]).tolist(),
+            "confidence": self.confidence,
+            "heat": self.heat,
+            "part": self.part,
+        }
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What both kinds of answer say.
+
+    Attributes:
+        part: what was looked for.
+        model: the first digits of the bundle's digest.
+        points_given: points sent, missing ones included.
+        points_used: points left after the crop.
+        seconds: by stage, and their ``total``.
+        warnings: sentences about an unusual cloud.
+    """
+
+    part: str
+    model: str
+    points_given: int
+    points_used: int
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "frame": FRAME,
+            "units": UNITS,
+            "part": self.part,
+            "model": self.model,
+            "points_given": self.points_given,
+            "points_used": self.points_used,
+            "seconds": dict(self.seconds),
+            "warnings": list(self.warnings),
+        }
+
+
+@dataclass(frozen=True)
+class Estimate(_Answer):
+    """Parts were found.
+
+    Attributes:
+        detections: most confident first, at least one.
+    """
+
+    detections: tuple[Detection, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON, with the list ``poses``."""
+        return {"answer": "estimate", "poses": [d.to_dict() for d in self.detections], **self._facts()}
+
+
+@dataclass(frozen=True)
+class Abstention(_Answer):
+    """No pose is answered, and why.
+
+    Attributes:
+        reason: ``too_few_points`` (an empty bin), ``nothing_found`` (nothing above the thresholds) or
+            ``deadline_exceeded``.
+        message: the reason in a sentence.
+    """
+
+    reason: Reason = "nothing_found"
+    message: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON; ``poses`` is there and empty."""
+        return {
+            "answer": "abstention",
+            "reason": self.reason,
+            "message": self.message,
+            "poses": [],
+            **self._facts(),
+        }
+
+
+def detections_from(outputs: Mapping[str, NDArray[np.float32]], card: ModelCard) -> tuple[tuple[Detection, ...], int]:
+    """The graph's proposals that pass the card's thresholds, most confident first.
+
+    The rule is the one by which training measured the model (``training/detections.py``).
+
+    Args:
+        outputs: of the graph, batch 1.
+        card: of the model.
+
+    Returns:
+        The detections, and how many more would have passed but have no finite pose.
+    """
+    heat, confidence = outputs["peak_heat"][0], outputs["confidence"][0]
+    center, quaternion = outputs["center"][0].astype(np.float64), outputs["quaternion"][0].astype(np.float64)
+    kept = (heat >= card.peak_threshold) & (heat > 0) & (confidence >= card.confidence_threshold) & (confidence > 0)
+    length = np.linalg.norm(quaternion, axis=1)
+    sound = np.isfinite(center).all(axis=1) & np.isfinite(length) & (length > 1e-6)
+    sound &= np.isfinite(heat) & np.isfinite(confidence)
+    index = np.flatnonzero(kept & sound)
+    index = index[np.argsort(-confidence[index], kind="stable")]
+    poses = transform(matrix_from_quaternion(quaternion[index]), center[index])
+    names = outputs["class_logits"][0][index].argmax(axis=1)
+    found = tuple(
+        Detection(pose, float(confidence[i]), card.classes[name], float(heat[i]))
+        for pose, i, name in zip(poses, index, names, strict=True)
+    )
+    return found, int((kept & ~sound).sum())

@@ -1,0 +1,44 @@
+"""Point clouds from files: PLY, PCD and NPY, told apart by their first bytes. Nothing in a file is believed unchecked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.inference.array_bytes import array_from_npy
+from attentionvote.inference.errors import InputError
+from attentionvote.inference.file_bytes import file_bytes
+from attentionvote.inference.preparation import MOST_POINTS
+
+
+def read_cloud(source: Path | str | bytes, name: str = "") -> NDArray[np.float32]:
+    """The points ``(P, 3)`` of a file, in the file's unit and frame; missing ones of organised clouds are left out.
+
+    Args:
+        source: path, or the file's content.
+        name: for messages when the content is given.
+
+    Raises:
+        InputError: with one sentence, when it is no cloud, damaged or too large.
+    """
+    content, name = file_bytes(source, name)
+    try:
+        if content.startswith(b"\x93NUMPY"):
+            return _npy(content)
+    except ValueError as error:
+        raise InputError(f"{name} must be a point cloud, but {error}") from error
+    raise InputError(f"{name} must be a point cloud as PLY, PCD or NPY, got another kind of file")
+
+
+def _npy(content: bytes) -> NDArray[np.float32]:
+    """Points of an array ``(P, 3)`` or ``(H, W, 3)``."""
+    array = array_from_npy(content, MOST_POINTS * 24)
+    if array.ndim not in (2, 3) or array.shape[-1] != 3:
+        raise ValueError(f"its array must have shape (P, 3) or (H, W, 3), got {array.shape}")
+    if array.dtype.kind != "f":
+        raise ValueError(f"its values must be floating-point metres, got {array.dtype}")
+    with np.errstate(over="ignore"):
+        points = array.reshape(-1, 3).astype(np.float32)
+    return points[~np.isnan(points).any(axis=1)] if array.ndim == 3 else points

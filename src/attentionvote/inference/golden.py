@@ -1,0 +1,100 @@
+"""The self-test of a cell: every golden cloud of a bundle must give the poses it gave when the bundle was made."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.geometry.pose import rotation_angle
+from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.inference.answer import Estimate
+from attentionvote.inference.bundle import Bundle, GoldenCloud
+from attentionvote.inference.errors import BundleError, InputError
+from attentionvote.inference.estimator import PoseEstimator
+
+TRANSLATION_TOLERANCE = 0.001
+ROTATION_TOLERANCE = math.radians(1.0)
+CLEAR_OF_THRESHOLD = 0.1
+
+
+def self_test(estimator: PoseEstimator, bundle: Bundle) -> list[str]:
+    """What is wrong with the answers to the golden clouds, one sentence each; empty when all are as expected.
+
+    A pose must come back within 1 mm and 1 degree, least over the part's symmetries. Poses whose confidence is
+    within 0.1 of the threshold may come and go: another processor rounds differently.
+
+    Args:
+        estimator: of the bundle; its crop is not applied, golden clouds hold parts only.
+        bundle: with the clouds.
+    """
+    try:
+        clouds = bundle.golden()
+        symmetry = Symmetry(**estimator.card.part.symmetry)
+    except (BundleError, ValueError, TypeError) as error:
+        return [str(error)]
+    problems = []
+    for cloud in clouds:
+        problems += _problems(estimator, cloud, symmetry)
+    return problems
+
+
+def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetry: Symmetry) -> list[str]:
+    try:
+        answer = estimator.estimate_parts_only(cloud.points)
+    except (InputError, RuntimeError) as error:
+        return [f"golden cloud {cloud.name} could not be estimated: {error}"]
+    detections = answer.detections if isinstance(answer, Estimate) else ()
+    poses = np.array([d.camera_from_part for d in detections]).reshape(-1, 4, 4)
+    clear = estimator.card.confidence_threshold + CLEAR_OF_THRESHOLD
+    translation, rotation = pose_errors(cloud.camera_from_part, poses, symmetry)
+    good = (translation <= TRANSLATION_TOLERANCE) & (rotation <= ROTATION_TOLERANCE)
+    # The expected poses choose their nearest answers, the clearest first; an answer serves one of them.
+    free = np.ones(len(poses), dtype=bool)
+    problems = []
+    for i in np.argsort(-cloud.confidence, kind="stable"):
+        fitting = np.flatnonzero(good[i] & free)
+        if len(fitting):
+            free[fitting[np.argmin(translation[i, fitting])]] = False
+        elif cloud.confidence[i] >= clear:
+            problems.append(_missing(cloud, int(i), translation[i], rotation[i]))
+    for j in np.flatnonzero(free):
+        if detections[j].confidence >= clear:
+            where = ", ".join(f"{1000 * x:.1f}" for x in poses[j, :3, 3])
+            problems.append(
+                f"golden cloud {cloud.name} gave a pose at ({where}) mm with confidence "
+                f"{detections[j].confidence:.2f} that was not there when the bundle was made"
+            )
+    return problems
+
+
+def _missing(cloud: GoldenCloud, index: int, translation: NDArray[np.float64], rotation: NDArray[np.float64]) -> str:
+    said = f"golden cloud {cloud.name} must give pose {index} with confidence {cloud.confidence[index]:.2f} again"
+    if not len(translation):
+        return f"{said}, but gave no pose at all"
+    nearest = int(np.argmin(translation))
+    return (
+        f"{said} within 1 mm and 1 degree, but the nearest is off by {1000 * translation[nearest]:.2f} mm "
+        f"and {math.degrees(rotation[nearest]):.2f} degrees"
+    )
+
+
+def pose_errors(
+    expected: NDArray[np.float64], found: NDArray[np.float64], symmetry: Symmetry
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distances in metres and angles in radians ``(E, F)`` between poses ``(E, 4, 4)`` and ``(F, 4, 4)``.
+
+    Angles are least over the symmetries; for a body of revolution between the axes, of at most 90 degrees with flip.
+    """
+    translation = np.linalg.norm(expected[:, None, :3, 3] - found[None, :, :3, 3], axis=-1)
+    turns, others = expected[:, None, :3, :3], found[None, :, :3, :3]
+    if not symmetry.is_revolution:
+        alike = others[:, :, None] @ symmetry.rotations()
+        return translation, rotation_angle(turns[:, :, None], alike).min(axis=-1, initial=np.pi)
+    axis = np.asarray(symmetry.axis)
+    a, b = turns @ axis, others @ axis
+    chord = np.linalg.norm(a - b, axis=-1)
+    if symmetry.flip:
+        chord = np.minimum(chord, np.linalg.norm(a + b, axis=-1))
+    return translation, 2 * np.arcsin(np.clip(chord / 2, 0, 1))

@@ -1,0 +1,170 @@
+"""From a sensor's cloud to the graph's inputs, as training did it: crop, random subset, normals of the dense cloud.
+
+Normals come from ``geometry.pointcloud.estimate_normals``, which made the training's clouds too. The random choices
+have a fixed seed, so the same cloud gives the same inputs, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.contract import ModelCard
+from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
+from attentionvote.geometry.pose import apply, inverse
+from attentionvote.inference.errors import InputError
+from attentionvote.inference.scale_check import check_scale
+
+MOST_POINTS = 4_000_000
+SEED = 0
+
+
+class TooFewPoints(Exception):
+    """Nothing to work on: an answer about the bin, not an error of the caller.
+
+    Attributes:
+        given: points sent.
+        used: points left.
+    """
+
+    def __init__(self, message: str, given: int, used: int) -> None:
+        super().__init__(message)
+        self.given, self.used = given, used
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """The inside of the bin, where parts are looked for.
+
+    Args:
+        camera_from_bin: ``(4, 4)``; bin frame: middle of the floor, z up.
+        size: ``(3,)`` inner length, width and height, metres.
+        margin: metres kept away from floor and walls, so that neither is taken for a part.
+
+    Raises:
+        InputError: when the pose is not rigid or a length is impossible.
+    """
+
+    camera_from_bin: NDArray[np.float64]
+    size: NDArray[np.float64]
+    margin: float = 0.002
+
+    def __post_init__(self) -> None:
+        for name, shape in (("camera_from_bin", (4, 4)), ("size", (3,))):
+            try:
+                value = np.asarray(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"bin {name} must be {shape} numbers, got something else") from error
+            if value.shape != shape or not np.isfinite(value).all():
+                raise InputError(f"bin {name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        pose, size = self.camera_from_bin, self.size
+        turn = pose[:3, :3]
+        rigid = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0
+        if not rigid or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-9:
+            raise InputError(
+                "bin camera_from_bin must be a rigid transform (a rotation, a translation, last row 0 0 0 1), "
+                "got another matrix: is it transposed, scaled or mirrored?"
+            )
+        if not (size > 0).all() or size.max() > 20:
+            raise InputError(f"bin size must be three positive lengths in metres, at most 20, got {size.tolist()}")
+        if not 0 <= self.margin < size.min() / 2:
+            raise InputError(
+                f"bin margin must be metres from 0 to less than half the bin's smallest side ({size.min() / 2:g}), "
+                f"got {self.margin}"
+            )
+
+    def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which of the points ``(P, 3)`` lie in the bin; the bin is open to above by its height."""
+        local = apply(inverse(self.camera_from_bin), points)
+        half = self.size[:2] / 2 - self.margin
+        level = (local[:, 2] >= self.margin) & (local[:, 2] <= self.size[2])
+        return level & (np.abs(local[:, :2]) <= half).all(axis=1)
+
+
+class Prepared(NamedTuple):
+    """The graph's inputs and where they come from.
+
+    Attributes:
+        points, normals: ``(1, N, 3)`` float32, camera frame.
+        given: points sent.
+        used: points left without missing ones and after the crop.
+        warnings: sentences about an unusual cloud.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    given: int
+    used: int
+    warnings: tuple[str, ...]
+
+
+def fewest_points(card: ModelCard) -> int:
+    """With fewer points than neighbours in a normal's estimation every normal comes from the same, whole cloud."""
+    return max(3, card.normal_neighbors)
+
+
+def prepare(points: NDArray[Any], card: ModelCard, crop: Crop | None = None, seed: int = SEED) -> Prepared:
+    """The graph's inputs from a cloud.
+
+    Args:
+        points: ``(P, 3)``, or an organised cloud ``(H, W, 3)`` in which NaN is missing; metres, camera frame.
+            A point exactly at the origin is missing too: that is how sensors without NaN write it.
+        card: of the model.
+        crop: the inside of the bin; None: the cloud holds parts only.
+        seed: of the random choices.
+
+    Raises:
+        InputError: when the array is no cloud, or is not in metres in the camera frame.
+        TooFewPoints: when fewer points are left than normals need.
+    """
+    cloud, given = checked_cloud(points)
+    check_scale(cloud, card, cropped=False, crop_follows=crop is not None)
+    seen = len(cloud)
+    if crop is not None:
+        cloud = cloud[crop.inside(cloud)]
+    least = fewest_points(card)
+    if len(cloud) < least:
+        where = f" are left in the bin of {seen} measured" if crop is not None else " were measured"
+        raise TooFewPoints(
+            f"{len(cloud)} points{where}, at least {least} are needed to look for parts", given, len(cloud)
+        )
+    warnings = check_scale(cloud, card, cropped=True, crop_follows=False)
+    rng = np.random.default_rng(seed)
+    dense = cloud if len(cloud) <= card.density else cloud[sample_indices(len(cloud), card.density, rng)]
+    chosen = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])
+    normals = estimate_normals(dense, chosen, card.normal_neighbors)
+    return Prepared(chosen[None], normals[None], given, len(cloud), warnings)
+
+
+def checked_cloud(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
+    """The measured points ``(P, 3)`` float32 of a cloud and how many places it had.
+
+    Raises:
+        InputError: on another shape or type, too many points, or values that are not finite.
+    """
+    if not isinstance(points, np.ndarray) or points.ndim not in (2, 3) or points.shape[-1] != 3:
+        shape = points.shape if isinstance(points, np.ndarray) else type(points).__name__
+        raise InputError(f"points must be an array (P, 3), or organised (H, W, 3), got {shape}")
+    if points.dtype.kind != "f":
+        raise InputError(
+            f"points must be floating-point metres, got {points.dtype}: divide counts by their scale first"
+        )
+    given = points.size // 3
+    if given > MOST_POINTS:
+        raise InputError(f"points must be at most {MOST_POINTS}, got {given}: crop or thin the cloud out")
+    flat = points.reshape(-1, 3)
+    if points.ndim == 3:
+        flat = flat[~np.isnan(flat).any(axis=1)]
+    with np.errstate(over="ignore"):
+        cloud = flat.astype(np.float32)
+    finite = np.isfinite(cloud).all(axis=1)
+    if not finite.all():
+        remedy = "drop them, or send the organised cloud (H, W, 3) in which NaN is missing"
+        if points.ndim == 3:
+            remedy = "in an organised cloud a missing point is NaN"
+        raise InputError(f"points must be finite, got {int((~finite).sum())} of {given} with NaN or inf: {remedy}")
+    return np.ascontiguousarray(cloud[cloud.any(axis=1)]), given
