@@ -60,7 +60,12 @@ def heatmap_peaks(
     """
     with full_precision(votes.device):
         heat, beaten, mean = _heatmap(votes, voxel_size, window)
-    peak_heat, at = torch.topk(heat * (1.0 - beaten), min(count, votes.shape[1]), dim=1)
+    height = heat * (1.0 - beaten)
+    # Equal heats in the order of their votes, whatever computes the sum: the same peaks in training and in the cell.
+    total = votes.shape[1]
+    later = torch.arange(total, device=votes.device)
+    at = torch.topk(torch.round(height / _TIE).long() * total - later, min(count, total), dim=1)[1]
+    peak_heat = torch.take_along_dim(height, at, dim=1)
     seeds = mean if center_seed == "mean" else (torch.floor(votes / voxel_size) + 0.5) * voxel_size
     batch = torch.arange(len(votes), device=votes.device)[:, None]
     return Peaks(seeds[batch, at], peak_heat, heat)
@@ -71,11 +76,13 @@ def heatmap_reference(
 ) -> tuple[Float[Tensor, "batch votes"], Float[Tensor, "batch votes"], Float[Tensor, "batch votes 3"]]:
     """Heat of each vote's voxel, 1 where a hotter or earlier vote is near, and the heat-weighted mean of the votes."""
     voxel = torch.floor(votes / voxel_size)
-    difference = voxel[:, :, None] - voxel[:, None]
+    # Axis by axis: matrices M x M stay contiguous, which a last dimension of three would not.
+    x, y, z = (a[:, :, None] - a[:, None] for a in voxel.unbind(-1))
     # exp(-d^2 / 2) at d = 0 and +-1, and 0 beyond: exact on integers.
-    weight = _CENTER * torch.relu(1.0 - (1.0 - _SIDE) * difference.square()).prod(-1)
+    gx, gy, gz = (torch.relu(1.0 - (1.0 - _SIDE) * d.square()) for d in (x, y, z))
+    weight = _CENTER * (gx * gy * gz)
     heat = weight.sum(-1)
-    near = difference.abs().amax(-1) <= window
+    near = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= window
     index = torch.arange(votes.shape[1], device=votes.device)
     # Equal voxels have equal heat only up to the order of summation; the tolerance restores the tie.
     ahead = heat[:, None] - heat[:, :, None]

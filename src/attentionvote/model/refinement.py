@@ -118,6 +118,7 @@ class Refiner(nn.Module):
     ) -> None:
         super().__init__()
         self.diameter, self.points = diameter, points
+        self.scale = 2.0 / diameter  # positions looked at are of order one
         margin = 0.06 * diameter
         corners = torch.tensor(box, dtype=torch.float32) + torch.tensor([[-margin], [margin]])
         self.box: Tensor
@@ -141,12 +142,22 @@ class Refiner(nn.Module):
         """One correction; the given pose is taken as a measurement and gets no gradient."""
         center, rotation = center.detach(), rotation.detach()
         with full_precision(points.device):
-            seen = points_in_box(points, normals, sample, center, rotation, self.box, 2.0 / self.diameter, self.points)
+            seen = points_in_box(points, normals, sample, center, rotation, self.box, self.scale, self.points)
         nobody = torch.zeros(seen.shape[:2], dtype=torch.long, device=seen.device)
-        pooled = torch.relu(self.norm(pooled_mlp(seen, None, nobody, list(self.weights))))
+        return self.correct(pooled_mlp(seen, None, nobody, list(self.weights)), center, rotation, context)
+
+    def correct(
+        self,
+        pooled: Float[Tensor, "rows width"],
+        center: Float[Tensor, "rows 3"],
+        rotation: Float[Tensor, "rows 3 3"],
+        context: Float[Tensor, "rows channels"],
+    ) -> Refined:
+        """The corrected poses, given the maximum over the points that were looked at."""
+        pooled = torch.relu(self.norm(pooled))
         out = widened(self.output(self.mlp(torch.cat([pooled, context], dim=-1))))
         identity = torch.tensor([1.0, 0, 0, 0, 1.0, 0], device=out.device)
-        with full_precision(points.device):
+        with full_precision(center.device):
             shift = (rotation @ out[:, :3, None])[..., 0] * (0.1 * self.diameter)
             turn = matrix_from_six(identity + 0.3 * out[:, 3:9])
             return Refined(center + shift, rotation @ turn, out[:, 9])

@@ -1,0 +1,133 @@
+"""The network as the exporter sees it: the same modules and weights, with neighbours found inside the graph.
+
+Not a second network: ``ExportNetwork`` calls ``AttentionVote.forward`` itself. Only what a CPU runtime needs in
+another order is replaced, layer by layer: the shared MLPs with their maximum, and the view of the refinement, go
+through a ``scan`` over a few rows at a time, so that the activations stay in the cache (the largest single gain of
+the exported graph).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch._higher_order_ops.scan import scan
+
+from attentionvote.export.graph_neighbors import find_neighborhoods
+from attentionvote.model import AttentionVote, Predictions
+from attentionvote.model.backbone import SetAbstraction
+from attentionvote.model.point_features import pair_features_reference
+from attentionvote.model.pooled_mlp import pooled_mlp_reference
+from attentionvote.model.refinement import Refined, Refiner
+
+_ROWS = 1024  # neighbours a step: a few hundred kilobytes of activations
+
+
+class GraphSetAbstraction(nn.Module):
+    """``SetAbstraction`` of a batch of one, a few centres at a time."""
+
+    def __init__(self, layer: SetAbstraction) -> None:
+        super().__init__()
+        self.layer = layer
+
+    def forward(
+        self,
+        xyz: Float[Tensor, "1 points 3"],
+        normals: Float[Tensor, "1 points 3"],
+        features: Float[Tensor, "1 points channels"] | None,
+        centers: Float[Tensor, "1 centers 3"],
+        center_normals: Float[Tensor, "1 centers 3"],
+        neighbors: Int[Tensor, "1 centers neighbors"],
+    ) -> Float[Tensor, "1 centers out"]:
+        """Features of the centres."""
+        points, directions, weights = xyz[0], normals[0], list(self.layer.weights)
+        projected = None
+        if self.layer.project is not None and features is not None:
+            projected = self.layer.project(features[0])
+        chunk = _chunk(neighbors.shape[1], neighbors.shape[2])
+        blocks = tuple(t.reshape(-1, chunk, t.shape[-1]) for t in (centers, center_normals, neighbors))
+
+        def step(carry: Tensor, block: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            middle, direction, index = block
+            geometry = pair_features_reference(points, directions, middle, direction, index, self.layer.radius)
+            return carry.clone(), pooled_mlp_reference(geometry, projected, index, weights)
+
+        _, pooled = scan(step, torch.zeros(1), blocks)
+        return self.layer.finish(pooled.reshape(neighbors.shape[1], -1))[None]
+
+
+class GraphRefiner(nn.Module):
+    """``Refiner`` of a batch of one, a pose at a time."""
+
+    def __init__(self, layer: Refiner) -> None:
+        super().__init__()
+        self.layer = layer
+
+    def forward(
+        self,
+        points: Float[Tensor, "1 points 3"],
+        normals: Float[Tensor, "1 points 3"],
+        sample: Int[Tensor, " rows"],
+        center: Float[Tensor, "rows 3"],
+        rotation: Float[Tensor, "rows 3 3"],
+        context: Float[Tensor, "rows channels"],
+    ) -> Refined:
+        """One correction of every pose; ``sample`` is all zeros."""
+        del sample
+        layer, weights = self.layer, list(self.layer.weights)
+        xyz, directions = points[0].T, normals[0]
+        total, count = points.shape[1], min(layer.points, points.shape[1])
+        low, high = (corner.clone() for corner in layer.box)
+        # First in index order = largest of a falling rank; 0 for a point outside.
+        rank = torch.arange(total, 0, -1, dtype=torch.float32)
+
+        def step(carry: Tensor, pose: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            middle, turn = pose
+            local = turn.T @ (xyz - middle[:, None])
+            inside = torch.minimum(local - low[:, None], high[:, None] - local).amin(0) >= 0
+            found, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count)
+            number = (found > 0).sum()
+            index = index[torch.arange(layer.points) % number.clamp(min=1)]
+            seen = torch.cat([local[:, index].T * layer.scale, directions[index] @ turn], dim=-1)
+            seen = seen * (number > 0).to(seen.dtype)
+            pooled = pooled_mlp_reference(seen[None], None, index[None], weights)
+            return carry.clone(), pooled[0]
+
+        _, pooled = scan(step, torch.zeros(1), (center, rotation))
+        return layer.correct(pooled, center, rotation, context)
+
+
+class ExportNetwork(nn.Module):
+    """Points and normals in, poses out, nothing else needed: ``AttentionVote`` for a batch of one.
+
+    Args:
+        model: a trained network; its weights are shared, it is not changed.
+    """
+
+    def __init__(self, model: AttentionVote) -> None:
+        super().__init__()
+        model = _shallow(model)
+        model.backbone = _shallow(model.backbone)
+        model.backbone.abstractions = nn.ModuleList(map(GraphSetAbstraction, model.backbone.abstractions))  # type: ignore[arg-type]
+        model.refiners = nn.ModuleList(map(GraphRefiner, model.refiners))  # type: ignore[arg-type]
+        self.model = model.eval()
+
+    def forward(self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"]) -> Predictions:
+        """What ``AttentionVote.forward`` answers for the same cloud."""
+        predictions: Predictions = self.model(points, normals, find_neighborhoods(points, self.model.layout))
+        return predictions
+
+
+def _shallow(module: nn.Module) -> nn.Module:
+    """A module with the same weights whose children can be replaced without the original noticing."""
+    twin = copy.copy(module)
+    twin._modules = dict(module._modules)
+    return twin
+
+
+def _chunk(rows: int, neighbors: int) -> int:
+    """Centres a step: the largest number that divides ``rows`` and keeps to ``_ROWS`` neighbours."""
+    return next(n for n in range(max(1, min(rows, _ROWS // neighbors)), 0, -1) if rows % n == 0)
