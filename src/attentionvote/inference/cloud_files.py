@@ -1,4 +1,4 @@
-"""Point clouds from files: PLY, PCD and NPY, told apart by their first bytes. Nothing in a file is believed unchecked."""
+"""Point clouds from files: PLY, PCD and NPY, told apart by their first bytes. No size in a header is believed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.inference.array_bytes import array_from_npy
+from attentionvote.inference import pcd_file, ply_file
+from attentionvote.inference.array_bytes import NPY_MAGIC, array_from_npy
+from attentionvote.inference.depth_files import PNG_MAGIC
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.file_bytes import file_bytes
 from attentionvote.inference.preparation import MOST_POINTS
@@ -25,10 +27,16 @@ def read_cloud(source: Path | str | bytes, name: str = "") -> NDArray[np.float32
     """
     content, name = file_bytes(source, name)
     try:
-        if content.startswith(b"\x93NUMPY"):
+        if content.startswith(NPY_MAGIC):
             return _npy(content)
+        if content.startswith(ply_file.MAGIC):
+            return ply_file.points_from_ply(content, MOST_POINTS)
+        if content.startswith(pcd_file.MAGIC):
+            return pcd_file.points_from_pcd(content, MOST_POINTS)
     except ValueError as error:
         raise InputError(f"{name} must be a point cloud, but {error}") from error
+    if content.startswith(PNG_MAGIC):
+        raise InputError(f"{name} must be a point cloud, got a PNG: a depth image needs its camera (`--cell`)")
     raise InputError(f"{name} must be a point cloud as PLY, PCD or NPY, got another kind of file")
 
 
@@ -39,6 +47,8 @@ def _npy(content: bytes) -> NDArray[np.float32]:
         raise ValueError(f"its array must have shape (P, 3) or (H, W, 3), got {array.shape}")
     if array.dtype.kind != "f":
         raise ValueError(f"its values must be floating-point metres, got {array.dtype}")
-    with np.errstate(over="ignore"):
+    if array.size > 3 * MOST_POINTS:
+        raise ValueError(f"it must have at most {MOST_POINTS} points, got {array.size // 3}")
+    with np.errstate(over="ignore", invalid="ignore"):
         points = array.reshape(-1, 3).astype(np.float32)
     return points[~np.isnan(points).any(axis=1)] if array.ndim == 3 else points

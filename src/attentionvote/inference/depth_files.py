@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.geometry.pointcloud import back_project
-from attentionvote.inference.array_bytes import array_from_npy
+from attentionvote.inference.array_bytes import NPY_MAGIC, array_from_npy
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.file_bytes import file_bytes
 
 MOST_PIXELS = 16_000_000
-_PNG = b"\x89PNG\r\n\x1a\n"
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ def read_depth(source: Path | str | bytes, name: str = "") -> NDArray[Any]:
         InputError: with one sentence, when it is no depth image, damaged or too large.
     """
     content, name = file_bytes(source, name)
-    if content.startswith(_PNG):
+    if content.startswith(PNG_MAGIC):
         return _png(content, name)
-    if content.startswith(b"\x93NUMPY"):
+    if content.startswith(NPY_MAGIC):
         try:
             image = array_from_npy(content, 8 * MOST_PIXELS)
         except ValueError as error:
@@ -116,7 +116,7 @@ def read_depth(source: Path | str | bytes, name: str = "") -> NDArray[Any]:
 
 def is_depth(content: bytes) -> bool:
     """Whether a file's content is a PNG, which can only be a depth image."""
-    return content.startswith(_PNG)
+    return content.startswith(PNG_MAGIC)
 
 
 def _png(content: bytes, name: str) -> NDArray[np.uint16]:
