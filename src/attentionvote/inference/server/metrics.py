@@ -1,0 +1,102 @@
+"""What the cell can be watched by: Prometheus metrics in a registry of the server's own."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disable_created_metrics, generate_latest
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+
+OUTCOMES = ("ok", "abstained", "rejected", "unauthorized", "overloaded", "unavailable", "deadline", "gone", "failed")
+STAGES = ("receive", "parse", "queue", "estimate", "total")
+SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0)
+DETECTIONS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
+RELOADS = ("loaded", "refused", "failed", "last_known_good")
+ABSTENTIONS = ("too_few_points", "nothing_found", "deadline_exceeded")
+
+
+class Metrics:
+    """Every metric of the server. What can be counted starts at 0, so that a rate has a beginning."""
+
+    def __init__(self) -> None:
+        disable_created_metrics()  # a time beside every counter says nothing here and doubles the page
+        self.registry = CollectorRegistry()
+        prefix = "attentionvote_"
+        self.requests = Counter(
+            prefix + "requests", "Requests for poses by outcome", ["outcome"], registry=self.registry
+        )
+        self.seconds = Histogram(
+            prefix + "request_seconds", "Seconds of a request by stage", ["stage"], buckets=SECONDS,
+            registry=self.registry,
+        )  # fmt: skip
+        self.waiting = Gauge(
+            prefix + "queue_depth", "Requests admitted and not yet answered, the running one included",
+            registry=self.registry,
+        )  # fmt: skip
+        self.abstentions = Counter(
+            prefix + "abstentions", "Answers without poses by reason", ["reason"], registry=self.registry
+        )
+        self.detections = Histogram(
+            prefix + "detections", "Poses in an answer", buckets=DETECTIONS, registry=self.registry
+        )
+        self.ready = Gauge(prefix + "ready", "1 when a verified and self-tested model serves", registry=self.registry)
+        self.model = Gauge(
+            prefix + "model_info", "The model that serves", ["part", "version", "digest"], registry=self.registry
+        )
+        self.reloads = Counter(
+            prefix + "reloads", "Attempts to load a bundle by outcome", ["outcome"], registry=self.registry
+        )
+        self.reload_error = Gauge(
+            prefix + "reload_error_info", "Why the bundle at the served path is not the one that serves",
+            ["error"], registry=self.registry,
+        )  # fmt: skip
+        self.reload_failing = Gauge(
+            prefix + "reload_failing", "1 while the bundle at the served path cannot be served", registry=self.registry
+        )
+        self.from_last_known_good = Gauge(
+            prefix + "serving_last_known_good", "1 while the copy of the last good bundle serves, not the given path",
+            registry=self.registry,
+        )  # fmt: skip
+        self.kept = Gauge(
+            prefix + "last_known_good_kept", "1 when the model that serves is also kept on disk for the next start",
+            registry=self.registry,
+        )  # fmt: skip
+        self.registry.register(_Memory())
+        for outcome in OUTCOMES:
+            self.requests.labels(outcome)
+        for stage in STAGES:
+            self.seconds.labels(stage)
+        for reason in ABSTENTIONS:
+            self.abstentions.labels(reason)
+        for outcome in RELOADS:
+            self.reloads.labels(outcome)
+
+    def serving(self, part: str, version: str, digest: str, *, kept: bool, last_known_good: bool) -> None:
+        """Say which model serves from now on."""
+        self.model.clear()
+        self.model.labels(part, version, digest).set(1)
+        self.kept.set(kept)
+        self.from_last_known_good.set(last_known_good)
+
+    def reload_problem(self, sentence: str | None) -> None:
+        """Say why the bundle at the served path does not serve; None when it does."""
+        self.reload_error.clear()
+        self.reload_failing.set(sentence is not None)
+        if sentence is not None:
+            self.reload_error.labels(sentence).set(1)
+
+    def text(self) -> bytes:
+        """The exposition in Prometheus' text format."""
+        return generate_latest(self.registry)
+
+
+class _Memory(Collector):
+    """The process' peak of resident memory: a leak shows here first."""
+
+    def collect(self) -> Iterator[Metric]:
+        metric = GaugeMetricFamily("attentionvote_peak_memory_bytes", "Highest resident memory of the process so far")
+        metric.add_metric([], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
+        yield metric
