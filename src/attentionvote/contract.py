@@ -37,6 +37,9 @@ class PartCard:
         digest: sha256 of surface, diameter and symmetry.
         symmetry: arguments of ``geometry.symmetry.Symmetry``.
         box: lowest and highest corner in the part's own frame, metres.
+
+    Raises:
+        ValueError: with one sentence, on values that no part has.
     """
 
     name: str
@@ -45,6 +48,24 @@ class PartCard:
     digest: str
     symmetry: Mapping[str, Any]
     box: tuple[tuple[float, float, float], tuple[float, float, float]]
+
+    def __post_init__(self) -> None:
+        for name in ("name", "title", "digest"):
+            _check_text(f"part.{name}", getattr(self, name))
+        if not self.name:
+            raise ValueError("card part.name must not be empty")
+        if not isinstance(self.symmetry, Mapping):
+            raise ValueError(f"card part.symmetry must be the arguments of a symmetry, got {self.symmetry!r}")
+        object.__setattr__(self, "diameter", _length("part.diameter", self.diameter))
+        try:
+            low, high = (tuple(float(x) for x in corner) for corner in self.box)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"card part.box must be two corners of three numbers, got {self.box!r}") from error
+        if not len(low) == len(high) == 3 or not all(
+            a < b and b - a < math.inf for a, b in zip(low, high, strict=True)
+        ):
+            raise ValueError(f"card part.box must be a lowest and a highest corner in metres, got {[low, high]}")
+        object.__setattr__(self, "box", (low, high))
 
 
 @dataclass(frozen=True)
@@ -67,6 +88,9 @@ class ModelCard:
         versions: of the packages that made the graph.
         parity: figures of the proof of equality with the checkpoint.
         evaluation: figures of the test.
+
+    Raises:
+        ValueError: with one sentence, on values that no model has.
     """
 
     part: PartCard
@@ -92,18 +116,28 @@ class ModelCard:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"card {name} must be a whole number of at least 1, got {value!r}")
-        numbers = {"part.diameter": self.part.diameter, "extent": self.extent, "distance": self.distance[0]}
-        for name, number in numbers.items():
-            if not (math.isfinite(number) and number > 0):
-                raise ValueError(f"card {name} must be positive metres, got {number}")
-        if not self.distance[0] < self.distance[1]:
-            raise ValueError(f"card distance must be a rising range, got {list(self.distance)}")
+        object.__setattr__(self, "extent", _length("extent", self.extent))
+        if not isinstance(self.distance, (tuple, list)) or len(self.distance) != 2:
+            raise ValueError(f"card distance must be two lengths, nearest and farthest, got {self.distance!r}")
+        near, far = (_length("distance", value) for value in self.distance)
+        if not near < far:
+            raise ValueError(f"card distance must be a rising range, got {[near, far]}")
+        object.__setattr__(self, "distance", (near, far))
         for name in ("peak_threshold", "confidence_threshold"):
-            number = getattr(self, name)
-            if not (math.isfinite(number) and number >= 0):
+            number = _number(name, getattr(self, name))
+            if not number >= 0:
                 raise ValueError(f"card {name} must be a number of at least 0, got {number}")
-        if not self.classes:
-            raise ValueError("card classes must name at least one class, got none")
+            object.__setattr__(self, name, number)
+        if not isinstance(self.classes, (tuple, list)) or not self.classes:
+            raise ValueError(f"card classes must name at least one class, got {self.classes!r}")
+        for name in self.classes:
+            _check_text("classes", name)
+        object.__setattr__(self, "classes", tuple(self.classes))
+        for name in ("run_id", "commit"):
+            _check_text(name, getattr(self, name))
+        for name in ("data", "versions", "parity", "evaluation"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ValueError(f"card {name} must be values by name, got {getattr(self, name)!r}")
 
     @property
     def inputs(self) -> tuple[TensorSpec, ...]:
@@ -141,29 +175,20 @@ class ModelCard:
             ValueError: with one sentence, when the text is no card of this contract.
         """
         try:
-            content = json.loads(text)
-        except ValueError as error:
+            content = json.loads(text, parse_constant=_no_number)
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"a model card must be JSON, got a text that is none ({error})") from error
         if not isinstance(content, dict):
             raise ValueError(f"a model card must be a JSON object, got {type(content).__name__}")
         for name, expected in (("contract_version", VERSION), ("units", UNITS), ("frame", FRAME)):
-            if content.pop(name, None) != expected:
+            said = content.pop(name, None)
+            if said != expected or type(said) is not type(expected):
                 raise ValueError(
-                    f"a model card must have {name} {expected!r}, got {json.loads(text).get(name)!r}: "
+                    f"a model card must have {name} {expected!r}, got {said!r}: "
                     "export the model again with this version"
                 )
-        part = _plain("card part", PartCard, content.get("part"))
-        part["box"] = _tuples(part["box"])
         content = _plain("card", cls, content)
-        content |= {
-            "part": PartCard(**part),
-            "classes": tuple(content["classes"]),
-            "distance": tuple(map(float, content["distance"])),
-        }
-        try:
-            return cls(**content)
-        except TypeError as error:
-            raise ValueError(f"a model card must have fields of the right type: {error}") from error
+        return cls(**content | {"part": PartCard(**_plain("card part", PartCard, content["part"]))})
 
 
 def _plain(what: str, kind: type, content: object) -> dict[str, Any]:
@@ -175,5 +200,28 @@ def _plain(what: str, kind: type, content: object) -> dict[str, Any]:
     return dict(content)
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def _check_text(name: str, value: object) -> None:
+    if not isinstance(value, str):
+        raise ValueError(f"card {name} must be a text, got {value!r}")
+
+
+def _number(name: str, value: object) -> float:
+    """A finite number, also numpy's."""
+    try:
+        number = math.nan if isinstance(value, (str, bytes, bool)) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"card {name} must be a finite number, got {value!r}")
+    return number
+
+
+def _length(name: str, value: object) -> float:
+    number = _number(name, value)
+    if not number > 0:
+        raise ValueError(f"card {name} must be positive metres, got {number}")
+    return number
+
+
+def _no_number(word: str) -> None:
+    raise ValueError(f"{word} is no JSON")

@@ -44,10 +44,11 @@ class Detection(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Answer:
-    """What both kinds of answer say.
+class Estimate:
+    """Parts were found.
 
     Attributes:
+        detections: most confident first, at least one.
         part: what was looked for.
         model: the first digits of the bundle's digest.
         points_given: points sent, missing ones included.
@@ -56,6 +57,7 @@ class _Answer:
         warnings: sentences about an unusual cloud.
     """
 
+    detections: tuple[Detection, ...]
     part: str
     model: str
     points_given: int
@@ -63,56 +65,48 @@ class _Answer:
     seconds: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
-    def _facts(self) -> dict[str, Any]:
-        return {
-            "frame": FRAME,
-            "units": UNITS,
-            "part": self.part,
-            "model": self.model,
-            "points_given": self.points_given,
-            "points_used": self.points_used,
-            "seconds": dict(self.seconds),
-            "warnings": list(self.warnings),
-        }
-
-
-@dataclass(frozen=True)
-class Estimate(_Answer):
-    """Parts were found.
-
-    Attributes:
-        detections: most confident first, at least one.
-    """
-
-    detections: tuple[Detection, ...] = ()
-
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON, with the list ``poses``."""
-        return {"answer": "estimate", "poses": [d.to_dict() for d in self.detections], **self._facts()}
+        return {"answer": "estimate", "poses": [d.to_dict() for d in self.detections], **_facts(self)}
 
 
 @dataclass(frozen=True)
-class Abstention(_Answer):
+class Abstention:
     """No pose is answered, and why.
 
     Attributes:
         reason: ``too_few_points`` (an empty bin), ``nothing_found`` (nothing above the thresholds) or
             ``deadline_exceeded``.
         message: the reason in a sentence.
+        part, model, points_given, points_used, seconds, warnings: as in ``Estimate``.
     """
 
-    reason: Reason = "nothing_found"
-    message: str = ""
+    reason: Reason
+    message: str
+    part: str
+    model: str
+    points_given: int
+    points_used: int
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON; ``poses`` is there and empty."""
-        return {
-            "answer": "abstention",
-            "reason": self.reason,
-            "message": self.message,
-            "poses": [],
-            **self._facts(),
-        }
+        return {"answer": "abstention", "reason": self.reason, "message": self.message, "poses": [], **_facts(self)}
+
+
+def _facts(answer: Estimate | Abstention) -> dict[str, Any]:
+    """What both kinds of answer say."""
+    return {
+        "frame": FRAME,
+        "units": UNITS,
+        "part": answer.part,
+        "model": answer.model,
+        "points_given": answer.points_given,
+        "points_used": answer.points_used,
+        "seconds": dict(answer.seconds),
+        "warnings": list(answer.warnings),
+    }
 
 
 def detections_from(outputs: Mapping[str, NDArray[np.float32]], card: ModelCard) -> tuple[tuple[Detection, ...], int]:

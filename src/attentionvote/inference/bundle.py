@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
+from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.inference.array_bytes import arrays_from_npz
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.graph_card import card_text
@@ -39,7 +40,7 @@ from attentionvote.inference.signature import load_public_key, verify
 __all__ = ["Bundle", "BundleError", "GoldenCloud", "Trusted", "load_bundle", "write_manifest"]
 
 # The key whose signature is demanded, or its file; None checks hashes but no signature.
-Trusted: TypeAlias = Ed25519PublicKey | Path | None
+Trusted: TypeAlias = Ed25519PublicKey | Path | str | None
 _MOST_GOLDEN_BYTES = 256 * 1024 * 1024
 
 
@@ -97,7 +98,7 @@ def load_bundle(path: Path | str, trusted: Trusted) -> Bundle:
         BundleError: with one sentence that names the file and what to do.
     """
     folder = Path(path)
-    key = load_public_key(trusted) if isinstance(trusted, Path) else trusted
+    key = load_public_key(Path(trusted)) if isinstance(trusted, (Path, str)) else trusted
     with opened(folder) as handle:
         manifest = read_file(handle, MANIFEST, MOST_MANIFEST_BYTES, folder)
         signature = read_file(handle, SIGNATURE, MOST_MANIFEST_BYTES, folder)
@@ -134,7 +135,8 @@ def _card(folder: Path, content: bytes, model: bytes) -> ModelCard:
     """The card in ``card.json``, which must be the one that the graph carries."""
     try:
         card = ModelCard.from_json(content.decode("utf-8"))
-    except ValueError as error:
+        Symmetry(**card.part.symmetry)
+    except (ValueError, TypeError) as error:  # TypeError: arguments that no symmetry has
         raise BundleError(f"{folder}: {CARD}: {error}") from error
     try:
         inside = card_text(model)

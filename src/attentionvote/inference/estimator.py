@@ -15,7 +15,7 @@ from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection,
 from attentionvote.inference.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.depth_files import CameraIntrinsics
 from attentionvote.inference.errors import DeadlineExceeded, InputError
-from attentionvote.inference.preparation import Crop, TooFewPoints, prepare
+from attentionvote.inference.preparation import Crop, Prepared, TooFewPoints, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.inference.signature import PUBLIC_NAME, keys_folder
 
@@ -68,7 +68,8 @@ class PoseEstimator:
             points: ``(P, 3)`` or organised ``(H, W, 3)``, metres, camera frame.
             depth: ``(H, W)``, see ``CameraIntrinsics``.
             camera: of the depth image.
-            deadline_s: seconds from now; when they have passed the work is stopped and abstained from.
+            deadline_s: seconds from now; when they have passed there is an abstention. The graph is stopped at once,
+                the preparation before its next step (of some tenths of a second at most).
 
         Raises:
             InputError: when the input cannot be used.
@@ -117,7 +118,7 @@ class PoseEstimator:
             cloud = _cloud(points, depth, camera)
             facts["points_given"] = depth.size if depth is not None else cloud.size // 3
             clock.lap("read")
-            prepared = prepare(cloud, self.card, crop)
+            prepared = _prepared(cloud, self.card, crop, clock, depth is not None)
             facts |= {"points_used": prepared.used, "warnings": prepared.warnings}
             clock.lap("prepare")
             outputs = session.run(prepared.points, prepared.normals, clock.left())
@@ -156,8 +157,13 @@ class _Clock:
         """End a stage; DeadlineExceeded when it ended too late."""
         now = time.monotonic()
         self._seconds[stage], self._last = now - self._last, now
-        if self._deadline_s is not None and now - self._start >= self._deadline_s:
-            raise DeadlineExceeded(stage)
+        self.check()
+
+    def check(self) -> None:
+        """DeadlineExceeded when no time is left."""
+        left = self.left()
+        if left is not None and left <= 0:
+            raise DeadlineExceeded(f"the deadline of {self._deadline_s} s has passed")
 
     def left(self) -> float | None:
         """Seconds until the deadline; None without one."""
@@ -166,6 +172,15 @@ class _Clock:
     def seconds(self) -> dict[str, float]:
         """Of every stage that ended, and the total."""
         return {**self._seconds, "total": time.monotonic() - self._start}
+
+
+def _prepared(cloud: NDArray[Any], card: ModelCard, crop: Crop | None, clock: _Clock, from_depth: bool) -> Prepared:
+    try:
+        return prepare(cloud, card, crop, between=clock.check)
+    except InputError as error:
+        if from_depth:
+            raise InputError(f"{error} (a depth image: depth_scale and depth_offset of its camera decide)") from error
+        raise
 
 
 def _cloud(

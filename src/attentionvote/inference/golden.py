@@ -31,13 +31,10 @@ def self_test(estimator: PoseEstimator, bundle: Bundle) -> list[str]:
     """
     try:
         clouds = bundle.golden()
-        symmetry = Symmetry(**estimator.card.part.symmetry)
-    except (BundleError, ValueError, TypeError) as error:
+    except BundleError as error:
         return [str(error)]
-    problems = []
-    for cloud in clouds:
-        problems += _problems(estimator, cloud, symmetry)
-    return problems
+    symmetry = Symmetry(**bundle.card.part.symmetry)
+    return [problem for cloud in clouds for problem in _problems(estimator, cloud, symmetry)]
 
 
 def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetry: Symmetry) -> list[str]:

@@ -6,6 +6,7 @@ have a fixed seed, so the same cloud gives the same inputs, bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,23 +17,23 @@ from attentionvote.contract import ModelCard
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.geometry.pose import apply, inverse
 from attentionvote.inference.errors import InputError
-from attentionvote.inference.scale_check import check_scale
+from attentionvote.inference.scale_check import check_scene, check_unit
 
 MOST_POINTS = 4_000_000
 SEED = 0
+_FARTHEST = 20
 
 
 class TooFewPoints(Exception):
     """Nothing to work on: an answer about the bin, not an error of the caller.
 
     Attributes:
-        given: points sent.
         used: points left.
     """
 
-    def __init__(self, message: str, given: int, used: int) -> None:
+    def __init__(self, message: str, used: int) -> None:
         super().__init__(message)
-        self.given, self.used = given, used
+        self.used = used
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,18 @@ class Crop:
                 "bin camera_from_bin must be a rigid transform (a rotation, a translation, last row 0 0 0 1), "
                 "got another matrix: is it transposed, scaled or mirrored?"
             )
-        if not (size > 0).all() or size.max() > 20:
-            raise InputError(f"bin size must be three positive lengths in metres, at most 20, got {size.tolist()}")
+        if np.abs(pose[:3, 3]).max() > _FARTHEST:
+            raise InputError(
+                f"bin camera_from_bin must be in metres, at most {_FARTHEST} from the camera, "
+                f"got the translation {pose[:3, 3].tolist()}: are these millimetres? divide by 1000"
+            )
+        if not (size > 0).all() or size.max() > _FARTHEST:
+            raise InputError(
+                f"bin size must be three positive lengths in metres, at most {_FARTHEST}, "
+                f"got {size.tolist()}: are these millimetres? divide by 1000"
+            )
+        if isinstance(self.margin, bool) or not isinstance(self.margin, (int, float)):
+            raise InputError(f"bin margin must be a number of metres, got {self.margin!r}")
         if not 0 <= self.margin < size.min() / 2:
             raise InputError(
                 f"bin margin must be metres from 0 to less than half the bin's smallest side ({size.min() / 2:g}), "
@@ -107,7 +118,13 @@ def fewest_points(card: ModelCard) -> int:
     return max(3, card.normal_neighbors)
 
 
-def prepare(points: NDArray[Any], card: ModelCard, crop: Crop | None = None, seed: int = SEED) -> Prepared:
+def prepare(
+    points: NDArray[Any],
+    card: ModelCard,
+    crop: Crop | None = None,
+    seed: int = SEED,
+    between: Callable[[], None] = lambda: None,
+) -> Prepared:
     """The graph's inputs from a cloud.
 
     Args:
@@ -116,26 +133,27 @@ def prepare(points: NDArray[Any], card: ModelCard, crop: Crop | None = None, see
         card: of the model.
         crop: the inside of the bin; None: the cloud holds parts only.
         seed: of the random choices.
+        between: called before each step that takes long; what it raises ends the preparation.
 
     Raises:
         InputError: when the array is no cloud, or is not in metres in the camera frame.
         TooFewPoints: when fewer points are left than normals need.
     """
     cloud, given = checked_cloud(points)
-    check_scale(cloud, card, cropped=False, crop_follows=crop is not None)
+    check_unit(cloud, card)
     seen = len(cloud)
     if crop is not None:
+        between()
         cloud = cloud[crop.inside(cloud)]
     least = fewest_points(card)
     if len(cloud) < least:
         where = f" are left in the bin of {seen} measured" if crop is not None else " were measured"
-        raise TooFewPoints(
-            f"{len(cloud)} points{where}, at least {least} are needed to look for parts", given, len(cloud)
-        )
-    warnings = check_scale(cloud, card, cropped=True, crop_follows=False)
+        raise TooFewPoints(f"{len(cloud)} points{where}, at least {least} are needed to look for parts", len(cloud))
+    warnings = check_scene(cloud, card)
     rng = np.random.default_rng(seed)
     dense = cloud if len(cloud) <= card.density else cloud[sample_indices(len(cloud), card.density, rng)]
     chosen = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])
+    between()
     normals = estimate_normals(dense, chosen, card.normal_neighbors)
     return Prepared(chosen[None], normals[None], given, len(cloud), warnings)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from attentionvote.inference.errors import InputError
 
 REFUSED_FACTOR = 5.0
 WARNED_FACTOR = 1.2
+# Beside the bin a camera may see a hall, some ten times as far away; a wrong unit is off by more.
+WRONG_UNIT_FACTOR = 30.0
 _LOOKED_AT = 20_000  # points are enough for percentiles
 # What a cloud is multiplied by when it comes in another unit, and what to say.
 _UNITS = (
@@ -23,54 +26,80 @@ _UNITS = (
 )
 
 
-def check_scale(cloud: NDArray[np.float32], card: ModelCard, *, cropped: bool, crop_follows: bool) -> tuple[str, ...]:
-    """Warnings about a cloud ``(P, 3)`` of an unusual scale.
+class _Scale(NamedTuple):
+    """How a cloud compares with the model's scenes.
 
-    A wrong unit moves depth and extent alike; a scene that is merely seen from farther away, or a cloud with more
-    than the bin in it, moves one of them, and less. A small extent alone is nothing: bins become empty.
+    Attributes:
+        said: the comparison in words.
+        depth: factor by which its median depth lies beyond the farthest (above 1) or before the nearest (below 1).
+        extent: its largest side as a multiple of a scene's.
+        question: what may have happened.
+    """
 
-    Args:
-        cloud: measured points, metres.
-        card: of the model.
-        cropped: whether only the bin's inside is left.
-        crop_follows: whether the rest of the room will be cropped away yet.
+    said: str
+    depth: float
+    extent: float
+    question: str
+
+
+def check_unit(cloud: NDArray[np.float32], card: ModelCard) -> None:
+    """Refuse a cloud ``(P, 3)`` in another unit or frame, whatever else it shows beside the bin.
 
     Raises:
-        InputError: when depth or extent is off by a factor of 5 and more, or the points lie behind the camera.
+        InputError: when its depth is off by a factor of 30 and more, or most of it lies behind the camera.
     """
-    if not len(cloud):
-        return ()
-    some = cloud[:: max(1, len(cloud) // _LOOKED_AT)]
-    low, middle, high = np.percentile(some.astype(np.float64), [1, 50, 99], axis=0)
-    wide, depth = float((high - low)[:2].max()), float(middle[2])
-    size = max(wide, float((high - low)[2]))
-    near, far = card.distance
-    told = (
-        f"the cloud is {wide:.4g} wide and {depth:.4g} deep, "
-        f"the model knows scenes {card.extent:.3g} m wide at {near:.3g}..{far:.3g} m"
-    )
-    if depth <= 0:
-        raise InputError(
-            f"points must lie before the camera, in its frame (x right, y down, z forward), but {told}: "
-            "transform them into the camera frame, or turn y and z round when they come from OpenGL"
-        )
-    off = depth / far if depth > far else depth / near if depth < near else 1.0
-    wider = size / card.extent
-    if off >= REFUSED_FACTOR or off <= 1 / REFUSED_FACTOR:
-        raise InputError(f"points must be metres: {told}: {_question(depth / math.sqrt(near * far))}")
-    if crop_follows:
-        return ()
-    if wider >= REFUSED_FACTOR:
-        raise InputError(f"points must be of the bin only: {told}: crop the cloud (`bin` in the cell file)")
+    if len(cloud):
+        _refuse_depth(_scale(cloud, card), WRONG_UNIT_FACTOR)
+
+
+def check_scene(cloud: NDArray[np.float32], card: ModelCard) -> tuple[str, ...]:
+    """Warnings about a cloud ``(P, 3)`` of the bin's inside that is of an unusual scale.
+
+    A small extent alone is nothing: bins become empty.
+
+    Raises:
+        InputError: when depth or extent is off by a factor of 5 and more: that is another scene than any known.
+    """
+    scale = _scale(cloud, card)
+    _refuse_depth(scale, REFUSED_FACTOR)
+    if scale.extent >= REFUSED_FACTOR:
+        raise InputError(f"points must be of the bin only: {scale.said}: crop the cloud (`bin` in the cell file)")
     warnings = []
-    if cropped and not 1 / WARNED_FACTOR < off < WARNED_FACTOR:
-        warnings.append(f"the scene lies nearer or farther than trained: {told}")
-    if cropped and wider > WARNED_FACTOR:
-        warnings.append(f"the scene is larger than trained: {told}")
+    if not 1 / WARNED_FACTOR < scale.depth < WARNED_FACTOR:
+        warnings.append(f"the scene lies {'farther' if scale.depth > 1 else 'nearer'} than trained: {scale.said}")
+    if scale.extent > WARNED_FACTOR:
+        warnings.append(f"the scene is larger than trained: {scale.said}")
     return tuple(warnings)
 
 
+def _refuse_depth(scale: _Scale, factor: float) -> None:
+    if scale.depth <= 0:
+        raise InputError(
+            f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.said}: "
+            "transform them into the camera frame, or turn y and z round when they come from OpenGL"
+        )
+    if not 1 / factor < scale.depth < factor:
+        raise InputError(f"points must be metres: {scale.said}: {scale.question}")
+
+
+def _scale(cloud: NDArray[np.float32], card: ModelCard) -> _Scale:
+    """Percentiles, not extremes: single flying points say nothing about the unit."""
+    some = cloud[:: max(1, len(cloud) // _LOOKED_AT)]
+    low, middle, high = np.percentile(some.astype(np.float64), [1, 50, 99], axis=0)
+    wide, deep = float((high - low)[:2].max()), float(middle[2])
+    near, far = card.distance
+    said = (
+        f"the cloud is {wide:.4g} wide and {deep:.4g} deep, "
+        f"the model knows scenes {card.extent:.3g} m wide at {near:.3g}..{far:.3g} m"
+    )
+    depth = deep / far if deep > far else deep / near if deep < near else 1.0
+    return _Scale(said, depth, float((high - low).max()) / card.extent, _question(deep / math.sqrt(near * far)))
+
+
 def _question(factor: float) -> str:
-    """What may have happened when a cloud is ``factor`` times too large."""
-    unit, question = min(_UNITS, key=lambda entry: abs(math.log(factor / entry[0])))
-    return question if abs(math.log(factor / unit)) < math.log(2.2) else "check the unit and the sensor's settings"
+    """What may have happened when a cloud lies ``factor`` times too far away."""
+    if factor > 0:
+        unit, question = min(_UNITS, key=lambda entry: abs(math.log(factor / entry[0])))
+        if abs(math.log(factor / unit)) < math.log(2.2):
+            return question
+    return "check the unit and the sensor's settings"
