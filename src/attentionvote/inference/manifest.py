@@ -196,16 +196,18 @@ def read_file(handle: int, name: str, most: int, folder: Path) -> bytes:
             deeper = _open(inner, part, os.O_DIRECTORY, name, folder)
             os.close(inner)
             inner = deeper
-        file = os.fdopen(_open(inner, last, os.O_NONBLOCK, name, folder), "rb")
+        file = _open(inner, last, os.O_NONBLOCK, name, folder)  # a pipe must not make the reader wait
     finally:
         os.close(inner)
-    with file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+    try:
+        if not stat.S_ISREG(os.fstat(file).st_mode):
             raise BundleError(f"{folder}: {name} must be a plain file: {_AGAIN}")
-        try:
-            content = file.read(most + 1)
-        except OSError as error:
-            raise BundleError(f"{folder}: {name} cannot be read ({error.strerror}): {_AGAIN}") from error
+        with os.fdopen(file, "rb", closefd=False) as stream:
+            content = stream.read(most + 1)
+    except OSError as error:
+        raise BundleError(f"{folder}: {name} cannot be read ({error.strerror}): {_AGAIN}") from error
+    finally:
+        os.close(file)
     if len(content) > most:
         raise BundleError(f"{folder}: {name} must have at most {most} bytes, got more: is it a bundle's folder?")
     return content

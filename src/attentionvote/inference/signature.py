@@ -57,16 +57,17 @@ def make_keys(folder: Path) -> tuple[Path, Path]:
             "move it away to make a new pair, or make the pair in another folder"
         )
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not folder.is_dir():
+            folder.mkdir(parents=True, mode=0o700)
         key = load_private_key(private) if private.exists() else Ed25519PrivateKey.generate()
         if not private.exists():
             pem = key.private_bytes(
                 serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
             )
-            _create(private, pem, 0o600)
+            if not _create(private, pem, 0o600):
+                raise BundleError(f"{private} was made by another process just now: use it")
+        # Of one private key every process makes the same public one.
         _create(public, public_pem(key.public_key()), 0o644)
-    except FileExistsError as error:
-        raise BundleError(f"{folder} got keys from another process just now: use them") from error
     except OSError as error:
         raise BundleError(
             f"{folder} must be a folder that can be written, but {error.strerror}: name another"
@@ -79,8 +80,8 @@ def public_pem(key: Ed25519PublicKey) -> bytes:
     return key.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
 
 
-def _create(path: Path, content: bytes, mode: int) -> None:
-    """Write a new file, whole or not at all; FileExistsError when it is there."""
+def _create(path: Path, content: bytes, mode: int) -> bool:
+    """Write a new file, whole or not at all; False when there is one already, which is left as it is."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -89,9 +90,12 @@ def _create(path: Path, content: bytes, mode: int) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.link(temporary, path)  # fails where rename would overwrite
+    except FileExistsError:
+        return False
     finally:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
+    return True
 
 
 def load_private_key(path: Path) -> Ed25519PrivateKey:
