@@ -9,7 +9,6 @@ the exported graph).
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int

@@ -1,4 +1,4 @@
-"""A network as one self-contained ONNX file: standard operators, pinned opset, static shapes, the same bytes each time."""
+"""A network as one self-contained ONNX file: standard operators, pinned opset, static shapes, reproducible bytes."""
 
 from __future__ import annotations
 

@@ -20,9 +20,21 @@ import onnxruntime  # type: ignore[import-untyped]
 from attentionvote.contract import ModelCard, TensorSpec
 from attentionvote.inference.errors import BundleError, DeadlineExceeded
 
-__all__ = ["DeadlineExceeded", "Session", "runtime_version"]
+__all__ = ["DeadlineExceeded", "Session", "providers", "runtime_version"]
 
 _ERRORS_ONLY = 3
+_PROVIDERS = {
+    "CPU": "CPUExecutionProvider",
+    "CUDA": "CUDAExecutionProvider",
+    "TensorRT": "TensorrtExecutionProvider",
+    "OpenVINO": "OpenVINOExecutionProvider",
+}
+
+
+def providers() -> dict[str, str]:
+    """onnxruntime's names of the execution paths that its wheel on this machine brings, by short name."""
+    present = onnxruntime.get_available_providers()
+    return {name: provider for name, provider in _PROVIDERS.items() if provider in present}
 
 
 def runtime_version() -> str:
@@ -37,12 +49,13 @@ class Session:
         model: the ONNX file.
         card: what its tensors must be.
         threads: of one run.
+        provider: one of ``providers()``.
 
     Raises:
         BundleError: when the graph cannot be loaded or its tensors are not the card's.
     """
 
-    def __init__(self, model: bytes, card: ModelCard, threads: int = 1) -> None:
+    def __init__(self, model: bytes, card: ModelCard, threads: int = 1, provider: str = _PROVIDERS["CPU"]) -> None:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
@@ -52,7 +65,7 @@ class Session:
         # Threads that spin while they wait make a graph with loops several times slower.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(model, options, providers=[provider])
         except Exception as error:  # onnxruntime's exceptions have no common parent
             raise BundleError(
                 f"model.onnx must be a graph that onnxruntime {runtime_version()} can load, but it says: {_line(error)}"

@@ -1,0 +1,28 @@
+"""Export a trained model: one ONNX graph, proved equal to its checkpoint in task units, in a signed bundle.
+
+    make export OBJECT=connecting_rod [RUN=...]
+
+Takes the newest complete training of the part. Writes outputs/export/OBJECT/DIGEST and points `latest` at it; when
+graph and checkpoint differ by more than `limits`, only the report is written and the exit code is 1. The signing key
+is made on first use; the cell needs its public half (docs/operating-a-cell.md).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from command import command, configuring
+from omegaconf import DictConfig
+
+
+def run(cfg: DictConfig) -> dict[str, Any]:
+    """Export, prove, sign; where the bundle is and what the proof measured."""
+    from export_job import ExportJob
+
+    with configuring(f"object {cfg.object.name}"):
+        job = ExportJob.find(cfg)
+    return job.run()
+
+
+if __name__ == "__main__":
+    command("export", run)

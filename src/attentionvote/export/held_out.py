@@ -1,0 +1,93 @@
+"""The scenes that a training never saw, found again by the digest it kept: for the proof, for golden clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.data import Clouds, CloudSettings, collate, draw_sample, measure_clouds
+from attentionvote.data.samples import Batch
+from attentionvote.model import Layout
+from attentionvote.part import Part
+from attentionvote.simulation import PartCaster, SceneSet, Sensor, synthesize
+
+
+def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:
+    """What the training measured of a scene, from a checkpoint's metadata."""
+    stored = dict(metadata["clouds"])
+    return CloudSettings(**(stored | {"sensor": Sensor(**stored["sensor"])}))
+
+
+def find_test_scenes(metadata: dict[str, Any], part: Part, root: Path) -> SceneSet:
+    """The test scenes of a training, below ``root/scenes/PART``.
+
+    Args:
+        metadata: of the checkpoint; ``data.test`` is the content's digest.
+        part: must be the one the network was trained for.
+        root: where data lie.
+
+    Raises:
+        ValueError: when the part has changed since, or the scenes are gone.
+    """
+    trained = metadata["part"]
+    if trained["digest"] != part.digest:
+        raise ValueError(
+            f"{part.name} must be the part the network was trained for ({trained['digest'][:12]}), got "
+            f"{part.digest[:12]}: its mesh, diameter or symmetry has changed, train it again"
+        )
+    wanted = metadata["data"].get("test", "")
+    for manifest in sorted((root / "scenes" / part.name).glob("test-*/manifest.json")):
+        if SceneSet.is_complete(manifest.parent):
+            scenes = SceneSet.open(manifest.parent)
+            if scenes.digest == wanted:
+                return scenes
+    raise ValueError(
+        f"the test scenes {wanted[:12]} of the training must lie below {root / 'scenes' / part.name}, but they do not: "
+        "name their place with root=..., or train again"
+    )
+
+
+def measured(scenes: SceneSet, part: Part, settings: CloudSettings, root: Path, workers: int) -> Clouds:
+    """The clouds of the scenes as the training saw them; measured again where they are gone."""
+    return measure_clouds(scenes, part, settings, root / "clouds", workers)
+
+
+def spread(total: int, count: int) -> list[int]:
+    """``count`` of ``total`` indices, evenly spread; all of them when there are fewer.
+
+    Scenes of a drop cycle follow each other with more and more parts: a spread choice meets every filling.
+    """
+    return [int(i) for i in np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))]
+
+
+def samples(clouds: Clouds, indices: list[int], points: int, layout: Layout) -> Iterator[Batch]:
+    """Batches of one: the network's input for each scene, drawn reproducibly; empty scenes are left out."""
+    for index in indices:
+        if clouds.count(index) >= 3:
+            rng = np.random.default_rng([0, index])
+            yield collate([draw_sample(clouds[index], points, layout, None, rng)])
+
+
+def sensor_cloud(scenes: SceneSet, index: int, caster: PartCaster, settings: CloudSettings) -> NDArray[np.float32]:
+    """The whole cloud of a scene as the sensor delivers it, ``(P, 3)`` metres, parts only."""
+    record = scenes.records[index]
+    rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
+    return synthesize(record, caster, settings.sensor, settings.density, rng).points
+
+
+def working_volume(clouds: Clouds) -> tuple[tuple[float, float], float]:
+    """Nearest and farthest depth, and the largest side of the box around a cloud, over all scenes, metres."""
+    near, far, extent = np.inf, 0.0, 0.0
+    for index in range(len(clouds)):
+        points = clouds[index].points
+        if len(points) >= 3:
+            low, high = points.min(0), points.max(0)
+            near, far = min(near, float(low[2])), max(far, float(high[2]))
+            extent = max(extent, float((high - low).max()))
+    if not extent > 0:
+        raise ValueError("the test scenes must hold parts that can be seen, got only empty ones")
+    return (near, far), extent

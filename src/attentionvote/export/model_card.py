@@ -1,0 +1,75 @@
+"""The model card of a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+from attentionvote.contract import ModelCard, PartCard
+from attentionvote.model import AttentionVote
+from attentionvote.part import Part
+
+# Of the packages that decide what the graph is.
+_PACKAGES = ("attentionvote", "torch", "onnx", "onnxscript")
+
+
+def model_card(
+    model: AttentionVote,
+    metadata: Mapping[str, Any],
+    part: Part,
+    distance: tuple[float, float],
+    extent: float,
+    run_id: str = "",
+    commit: str = "",
+) -> ModelCard:
+    """What a cell must know of a trained network; figures of parity are added when they are measured.
+
+    Args:
+        model: the network.
+        metadata: of its checkpoint, see ``training.checkpoint.load_trained``.
+        part: its part.
+        distance, extent: of the scenes it was trained for, metres.
+        run_id: of the MLflow run.
+        commit: of the code that trained it.
+
+    Raises:
+        ValueError: when the checkpoint is one of an unfinished training, whose working point is not chosen yet.
+    """
+    threshold = metadata["confidence_threshold"]
+    if threshold is None:
+        raise ValueError("the checkpoint must be of a finished training (model.ckpt), got one without a working point")
+    stored = metadata["part"]
+    low, high = part.vertices.min(0), part.vertices.max(0)
+    return ModelCard(
+        part=PartCard(
+            name=stored["name"],
+            title=stored["title"],
+            diameter=float(stored["diameter"]),
+            digest=stored["digest"],
+            symmetry=_plain(stored["symmetry"]),
+            box=((float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2]))),
+        ),
+        classes=(stored["name"],),
+        points=int(metadata["points"]),
+        votes=model.layout.seeds,
+        proposals=min(model.proposals, model.layout.seeds),
+        density=int(metadata["clouds"]["density"]),
+        normal_neighbors=int(metadata["clouds"]["neighbors"]),
+        peak_threshold=float(metadata["peak_threshold"]),
+        confidence_threshold=float(threshold),
+        distance=distance,
+        extent=extent,
+        data=dict(metadata["data"]),
+        run_id=run_id,
+        commit=commit,
+        versions={name: version(name) for name in _PACKAGES},
+        evaluation={name: float(value) for name, value in metadata["test"].items()},
+    )
+
+
+def _plain(value: Any) -> Any:
+    """The same of what JSON knows: a card read again equals the card that was written."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,192 @@
+"""Proof of equality in task units: the same scenes through the checkpoint and through the exported graph.
+
+What a robot does with a model depends on its poses, so poses are compared, not tensors: every detection of one side
+must have its partner on the other, at most some hundredths of a millimetre and of a degree away, with the same
+confidence; and the average precision of both must be the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from attentionvote.data.samples import Batch
+from attentionvote.evaluation import PoseMetric, SceneResult, evaluate, rotation_errors
+from attentionvote.model import AttentionVote, Predictions
+from attentionvote.part import Part
+from attentionvote.training.detections import scene_results
+
+Arrays = Mapping[str, NDArray[np.float32]]
+Graph = Callable[[NDArray[np.float32], NDArray[np.float32]], Arrays]
+PARTNER = 0.05  # share of D within which a pose of the other side is the same detection
+NAMES = ("ap_10", "ap_5", "ap_2")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What may differ at most.
+
+    Args:
+        translation_mm, rotation_degrees, confidence: largest difference of a matched pair.
+        translation_p99_mm, rotation_p99_degrees: 99th percentile of all matched pairs.
+        unmatched: detections without a partner, both sides together.
+        ap: average precision at 10, 5 and 2 % of D.
+        scenes: least number of scenes for a proof.
+    """
+
+    translation_mm: float
+    translation_p99_mm: float
+    rotation_degrees: float
+    rotation_p99_degrees: float
+    confidence: float
+    unmatched: int
+    ap: float
+    scenes: int
+
+
+@dataclass(frozen=True)
+class Parity:
+    """Measured differences between checkpoint and graph; ``ap`` holds both sides' figures by name.
+
+    ``rotation`` is the least angle over the part's symmetries. ``pairs`` are matched detections.
+    """
+
+    scenes: int
+    pairs: int
+    unmatched: int
+    translation_mm: float
+    translation_p99_mm: float
+    rotation_degrees: float
+    rotation_p99_degrees: float
+    confidence: float
+    ap: Mapping[str, tuple[float, float]]
+
+    def violations(self, limits: Limits) -> list[str]:
+        """One sentence for every limit that is broken; none when graph and checkpoint are equal."""
+        broken = []
+        if self.scenes < limits.scenes:
+            broken.append(f"scenes must be at least {limits.scenes}, got {self.scenes}")
+        if not self.pairs:
+            broken.append("at least one detection must be compared, got none: the model finds nothing in these scenes")
+        for name in (
+            "translation_mm", "translation_p99_mm", "rotation_degrees", "rotation_p99_degrees", "confidence",
+            "unmatched",
+        ):  # fmt: skip
+            value, limit = getattr(self, name), getattr(limits, name)
+            if not value <= limit:
+                broken.append(f"{name} must be at most {limit:g}, got {value:.4g}")
+        for name, (ours, theirs) in self.ap.items():
+            if not abs(ours - theirs) <= limits.ap:
+                broken.append(f"{name} must agree within {limits.ap:g}, got {ours:.4f} and {theirs:.4f}")
+        return broken
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for the card and the report."""
+        return asdict(self) | {"ap": {name: [float(a), float(b)] for name, (a, b) in self.ap.items()}}
+
+
+def measure_parity(
+    model: AttentionVote,
+    graph: Graph,
+    samples: Iterable[Batch],
+    part: Part,
+    peak_threshold: float,
+    confidence_threshold: float,
+) -> Parity:
+    """Run checkpoint and graph on the same samples and compare what they find.
+
+    Args:
+        model: the network of the checkpoint, in evaluation.
+        graph: the exported file in its runtime: ``points``, ``normals`` ``(1, N, 3)`` to the outputs by name.
+        samples: batches of one, of scenes that were held out.
+        part: for distances and symmetries.
+        peak_threshold, confidence_threshold: what counts as a detection.
+    """
+    sides: tuple[list[SceneResult], list[SceneResult]] = ([], [])
+    for batch in samples:
+        with torch.no_grad():
+            sides[0].extend(scene_results(model(batch.points, batch.normals, batch.found), batch, peak_threshold))
+        outputs = graph(batch.points.numpy(), batch.normals.numpy())
+        theirs = Predictions(**{name: torch.from_numpy(outputs[name]) for name in Predictions._fields})
+        sides[1].extend(scene_results(theirs, batch, peak_threshold))
+    return compare(sides[0], sides[1], part, confidence_threshold)
+
+
+def compare(
+    ours: Sequence[SceneResult], theirs: Sequence[SceneResult], part: Part, confidence_threshold: float
+) -> Parity:
+    """Differences between two answers to the same scenes.
+
+    A detection (confidence at the threshold or above) may find its partner among all proposals of the other side: one
+    that stands a rounding error below the threshold is a partner still.
+    """
+    metric = PoseMetric.of(part)
+    shift, turn, trust, unmatched = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], 0
+    for a, b in zip(ours, theirs, strict=True):
+        i, j = _partners(metric, a, b, PARTNER * part.diameter)
+        sure_a, sure_b = a.scores >= confidence_threshold, b.scores >= confidence_threshold
+        unmatched += int(sure_a.sum() - sure_a[i].sum() + sure_b.sum() - sure_b[j].sum())
+        kept = sure_a[i] | sure_b[j]
+        i, j = i[kept], j[kept]
+        shift.append(1000 * np.linalg.norm(a.poses[i, :3, 3] - b.poses[j, :3, 3], axis=-1))
+        turn.append(np.degrees(rotation_errors(a.poses[i], b.poses[j], part.symmetry)))
+        trust.append(np.abs(a.scores[i] - b.scores[j]))
+    shifts, turns, trusts = (np.concatenate(values) for values in (shift, turn, trust))
+    figures = [evaluate(side, part, add=False) for side in (ours, theirs)]
+    return Parity(
+        scenes=len(ours),
+        pairs=len(shifts),
+        unmatched=unmatched,
+        translation_mm=float(shifts.max(initial=0.0)),
+        translation_p99_mm=_percentile(shifts),
+        rotation_degrees=float(turns.max(initial=0.0)),
+        rotation_p99_degrees=_percentile(turns),
+        confidence=float(trusts.max(initial=0.0)),
+        ap={name: (float(figures[0][name]), float(figures[1][name])) for name in NAMES},
+    )
+
+
+def table(parity: Mapping[str, Parity], limits: Limits) -> Iterator[str]:
+    """Lines for the terminal: a column for every execution path."""
+    names = list(parity)
+    rows: list[tuple[str, list[str], str]] = [
+        ("scenes", [f"{p.scenes}" for p in parity.values()], f">= {limits.scenes}"),
+        ("matched poses", [f"{p.pairs}" for p in parity.values()], ">= 1"),
+        ("unmatched poses", [f"{p.unmatched}" for p in parity.values()], f"{limits.unmatched}"),
+        ("translation, max (mm)", [f"{p.translation_mm:.4f}" for p in parity.values()], f"{limits.translation_mm:g}"),
+        ("translation, p99 (mm)", [f"{p.translation_p99_mm:.4f}" for p in parity.values()],
+         f"{limits.translation_p99_mm:g}"),
+        ("rotation, max (degrees)", [f"{p.rotation_degrees:.4f}" for p in parity.values()],
+         f"{limits.rotation_degrees:g}"),
+        ("rotation, p99 (degrees)", [f"{p.rotation_p99_degrees:.4f}" for p in parity.values()],
+         f"{limits.rotation_p99_degrees:g}"),
+        ("confidence, max", [f"{p.confidence:.5f}" for p in parity.values()], f"{limits.confidence:g}"),
+    ]  # fmt: skip
+    for name in NAMES:
+        cells = ["{:.4f} | {:.4f}".format(*p.ap[name]) for p in parity.values()]
+        rows.append((f"AP at {name[3:]} % D, torch | graph", cells, f"+-{limits.ap:g}"))
+    yield f"{'':32s}" + "".join(f"{name:>22s}" for name in names) + f"{'limit':>12s}"
+    for title, cells, limit in rows:
+        yield f"{title:32s}" + "".join(f"{cell:>22s}" for cell in cells) + f"{limit:>12s}"
+
+
+def _partners(
+    metric: PoseMetric, a: SceneResult, b: SceneResult, limit: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of nearest poses, at most ``limit`` metres apart."""
+    if not (len(a.poses) and len(b.poses)):
+        nothing = np.zeros(0, dtype=np.int64)
+        return nothing, nothing
+    distances = metric.distances(a.poses, b.poses)
+    i, j = linear_sum_assignment(np.minimum(distances, 2 * limit))
+    near = distances[i, j] <= limit
+    return i[near], j[near]
+
+
+def _percentile(values: NDArray[np.float64]) -> float:
+    return float(np.percentile(values, 99)) if len(values) else 0.0
