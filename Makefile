@@ -11,16 +11,20 @@ OBJECT ?=
 NAME ?=
 MESH ?=
 UNITS ?=
+RUN ?=
 ARGS ?=
 PYTEST_ARGS ?=
 object := $(if $(OBJECT),object=$(OBJECT))
 
+# A bundle's folder is named after its part, so these targets cannot do without one.
+bundle = $(if $(OBJECT),outputs/export/$(OBJECT)/latest,$(error OBJECT must be given, e.g. make $@ OBJECT=connecting_rod))
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train smoke generate view part ui test test-fast lint format clean
+.PHONY: help setup system train smoke export serve keys bench-serve generate view part ui test test-fast lint format clean
 
 help: ## Show this list
-	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(STAMP) ## Create .venv with the pinned dependencies (every other target does it when needed)
 
@@ -50,6 +54,18 @@ train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [ARGS="e
 
 smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores
 	@$(PY) pipelines/train.py object=$(or $(OBJECT),connecting_rod) experiment=smoke $(ARGS)
+
+export: $(STAMP) ## Prove the trained model equal to one ONNX file, sign the bundle: OBJECT=connecting_rod [RUN=...]
+	@$(PY) pipelines/export.py $(object) $(if $(RUN),run=$(RUN)) $(ARGS)
+
+serve: $(STAMP) ## Serve the newest bundle on this machine, as a cell does: OBJECT=connecting_rod [ARGS="--port 8080"]
+	@$(VENV)/bin/attentionvote serve $(bundle) $(ARGS)
+
+keys: $(STAMP) ## Make the pair of keys that signs bundles (export does it when there is none)
+	@$(VENV)/bin/attentionvote keys $(ARGS)
+
+bench-serve: $(STAMP) ## Load the server with 4 clients for a minute: OBJECT=connecting_rod [ARGS="--seconds 60"]
+	@$(PY) pipelines/bench_serve.py $(bundle) $(ARGS)
 
 generate: $(STAMP) ## Drop parts into a bin by physics and keep the scenes: OBJECT=connecting_rod
 	@$(PY) pipelines/generate.py $(object) $(ARGS)

@@ -15,9 +15,9 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     """A machine on which nothing has been compiled yet."""
     monkeypatch.setenv("ATTENTIONVOTE_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("CC", raising=False)
-    native.load.cache_clear()
+    native.compiled.cache_clear()
     yield tmp_path / "cache"
-    native.load.cache_clear()
+    native.compiled.cache_clear()
 
 
 def test_a_library_is_compiled_once_and_kept(empty_cache: Path) -> None:
@@ -26,7 +26,7 @@ def test_a_library_is_compiled_once_and_kept(empty_cache: Path) -> None:
     assert native.load("attentionvote.geometry", "pointops.c") is not None
     (kept,) = empty_cache.glob("pointops-*.so")
     changed = kept.stat().st_mtime_ns
-    native.load.cache_clear()
+    native.compiled.cache_clear()
     assert native.load("attentionvote.geometry", "pointops.c") is not None
     assert kept.stat().st_mtime_ns == changed
 
@@ -63,3 +63,13 @@ def test_a_function_without_memory_raises() -> None:
 
     with pytest.raises(MemoryError, match="ball_query ran out of memory"):
         native.call(Failing())
+
+
+def test_disabled_leaves_the_references_and_comes_back() -> None:
+    before = native.load("attentionvote.geometry", "pointops.c")
+    with native.disabled():
+        assert native.load("attentionvote.geometry", "pointops.c") is None
+        with native.disabled():
+            assert native.load("attentionvote.geometry", "pointops.c") is None
+        assert native.load("attentionvote.geometry", "pointops.c") is None
+    assert native.load("attentionvote.geometry", "pointops.c") is before

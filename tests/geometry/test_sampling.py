@@ -110,7 +110,7 @@ def test_without_a_compiler_there_is_a_warning_and_the_reference(
     monkeypatch.setenv("ATTENTIONVOTE_CACHE", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(shutil, "which", lambda _name: None)
-    native.load.cache_clear()
+    native.compiled.cache_clear()
     try:
         with pytest.warns(
             UserWarning, match=r"no C compiler found, pointops\.c is replaced by slow Python: install gcc"
@@ -118,4 +118,4 @@ def test_without_a_compiler_there_is_a_warning_and_the_reference(
             order = sampling.farthest_point_order(POINTS, 3)
         np.testing.assert_array_equal(order, sampling_reference.farthest_point_order(POINTS, 3))
     finally:
-        native.load.cache_clear()
+        native.compiled.cache_clear()

@@ -9,6 +9,7 @@ the exported graph).
 from __future__ import annotations
 
 import copy
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -22,6 +23,7 @@ from attentionvote.model.point_features import pair_features_reference
 from attentionvote.model.pooled_mlp import pooled_mlp_reference
 from attentionvote.model.refinement import Refined, Refiner
 
+Kind = TypeVar("Kind", bound=nn.Module)
 _ROWS = 1024  # neighbours a step: a few hundred kilobytes of activations
 
 
@@ -110,8 +112,10 @@ class ExportNetwork(nn.Module):
         super().__init__()
         model = _shallow(model)
         model.backbone = _shallow(model.backbone)
-        model.backbone.abstractions = nn.ModuleList(map(GraphSetAbstraction, model.backbone.abstractions))  # type: ignore[arg-type]
-        model.refiners = nn.ModuleList(map(GraphRefiner, model.refiners))  # type: ignore[arg-type]
+        model.backbone.abstractions = nn.ModuleList(
+            GraphSetAbstraction(layer) for layer in _layers(model.backbone.abstractions, SetAbstraction)
+        )
+        model.refiners = nn.ModuleList(GraphRefiner(layer) for layer in _layers(model.refiners, Refiner))
         self.model = model.eval()
 
     def forward(self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"]) -> Predictions:
@@ -120,7 +124,12 @@ class ExportNetwork(nn.Module):
         return predictions
 
 
-def _shallow(module: nn.Module) -> nn.Module:
+def _layers(modules: nn.ModuleList, kind: type[Kind]) -> list[Kind]:
+    """The modules of a list, which are all of one kind."""
+    return [module for module in modules if isinstance(module, kind)]
+
+
+def _shallow(module: Kind) -> Kind:
     """A module with the same weights whose children can be replaced without the original noticing."""
     twin = copy.copy(module)
     twin._modules = dict(module._modules)

@@ -90,7 +90,7 @@ def _example(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """A cloud to trace with; only its shape matters."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.1, -0.1, 0.7], [0.1, 0.1, 0.8], (1, count, 3)).astype(np.float32)
-    normals = np.broadcast_to(np.float32([0, 0, -1]), points.shape).copy()
+    normals = np.broadcast_to(np.array([0, 0, -1], dtype=np.float32), points.shape).copy()
     return torch.from_numpy(points), torch.from_numpy(normals)
 
 

@@ -5,6 +5,7 @@ No torch headers, no CUDA, no build step at installation: the first use compiles
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -14,6 +15,7 @@ import shutil
 import subprocess
 import tempfile
 import warnings
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -24,7 +26,20 @@ import numpy as np
 PORTABLE = ("-O3", "-std=gnu99", "-ffinite-math-only", "-fno-signed-zeros", "-shared", "-fPIC")
 
 
-@functools.cache
+_disabled = False
+
+
+@contextlib.contextmanager
+def disabled() -> Iterator[None]:
+    """Inside, ``load`` finds nothing: the slow references take over, to be compared with or timed against."""
+    global _disabled
+    before, _disabled = _disabled, True
+    try:
+        yield
+    finally:
+        _disabled = before
+
+
 def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
     """The compiled library of a C file that lies in a package, or None (with one warning) without a C compiler or
     a place to keep it.
@@ -37,6 +52,12 @@ def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
     Raises:
         OSError: when the compiler refuses the file, with the compiler's words.
     """
+    return None if _disabled else compiled(package, file, tuned)
+
+
+@functools.cache
+def compiled(package: str, file: str, tuned: bool) -> ctypes.CDLL | None:
+    """What ``load`` returns, once per process and file."""
     flags = (*PORTABLE, "-march=native") if tuned else PORTABLE
     source = resources.files(package).joinpath(file).read_bytes()
     machine = _processor() if tuned else platform.machine()
