@@ -13,8 +13,9 @@ from attentionvote.inference.errors import InputError
 
 REFUSED_FACTOR = 5.0
 WARNED_FACTOR = 1.2
-# Beside the bin a camera may see a hall, some ten times as far away; a wrong unit is off by more.
-WRONG_UNIT_FACTOR = 30.0
+# Beside the bin a camera may see a hall, some ten times as far away; inches for metres, the nearest
+# of the wrong units, are off by forty, of which the range of working distances hides less than a half.
+WRONG_UNIT_FACTOR = 20.0
 _LOOKED_AT = 20_000  # points are enough for percentiles
 # What a cloud is multiplied by when it comes in another unit, and what to say.
 _UNITS = (
@@ -46,7 +47,7 @@ def check_unit(cloud: NDArray[np.float32], card: ModelCard) -> None:
     """Refuse a cloud ``(P, 3)`` in another unit or frame, whatever else it shows beside the bin.
 
     Raises:
-        InputError: when its depth is off by a factor of 30 and more, or most of it lies behind the camera.
+        InputError: when its depth is off by a factor of 20 and more, or most of it lies behind the camera.
     """
     if len(cloud):
         _refuse_depth(_scale(cloud, card), WRONG_UNIT_FACTOR)
