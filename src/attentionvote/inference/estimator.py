@@ -36,6 +36,7 @@ class PoseEstimator:
 
     Raises:
         BundleError: when the bundle cannot be trusted or loaded.
+        ValueError: when ``threads`` is no positive number.
     """
 
     def __init__(
@@ -116,7 +117,8 @@ class PoseEstimator:
         }
         try:
             cloud = _cloud(points, depth, camera)
-            facts["points_given"] = depth.size if depth is not None else cloud.size // 3
+            if isinstance(cloud, np.ndarray):  # preparation refuses anything else
+                facts["points_given"] = depth.size if depth is not None else cloud.size // 3
             clock.lap("read")
             prepared = _prepared(cloud, self.card, crop, clock, depth is not None)
             facts |= {"points_used": prepared.used, "warnings": prepared.warnings}
@@ -196,4 +198,4 @@ def _cloud(
     if camera is not None:
         raise InputError("a camera belongs to a depth image, got one with points: leave it out")
     assert points is not None
-    return np.asarray(points)
+    return points

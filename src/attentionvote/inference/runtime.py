@@ -53,9 +53,12 @@ class Session:
 
     Raises:
         BundleError: when the graph cannot be loaded or its tensors are not the card's.
+        ValueError: when ``threads`` is no positive number.
     """
 
     def __init__(self, model: bytes, card: ModelCard, threads: int = 1, provider: str = _PROVIDERS["CPU"]) -> None:
+        if threads < 1:
+            raise ValueError(f"threads must be at least 1, got {threads}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
