@@ -180,7 +180,7 @@ def test_millimetres_are_one_sentence_and_code_2(
 def test_a_whole_bundle_is_verified(command: Command, bundle_folder: Path, trusted_key: Path) -> None:
     code, out, err = command("verify-bundle", bundle_folder)
     assert (code, err) == (0, "")
-    assert "signature holds, every hash holds, 1 golden clouds" in out
+    assert "signature holds, every hash holds, golden clouds: 1" in out
     assert command("verify-bundle", bundle_folder, "--key", trusted_key)[0] == 0
     assert "signature not checked" in command("verify-bundle", bundle_folder, "--no-signature")[1]
 
@@ -209,6 +209,26 @@ def test_a_bundle_with_a_bad_golden_cloud_is_not_whole(command: Command, make_bu
     code, _, err = command("verify-bundle", folder)
     assert code == 1
     assert "golden/cloud_0.npz must be a golden cloud" in one_sentence(err)
+
+
+def test_the_self_test_is_asked_for(command: Command, make_bundle: MakeBundle) -> None:
+    code, out, err = command("verify-bundle", make_bundle(), "--self-test")
+    assert (code, err) == (0, "")
+    assert out.endswith("golden clouds: 1, all of them reproduced\n")
+
+    def move(folder: Path) -> None:
+        path = folder / "golden" / "cloud_0.npz"
+        with np.load(path) as stored:
+            arrays = dict(stored)
+        arrays["camera_from_part"][:, 0, 3] += 0.002
+        np.savez(path, **arrays)
+
+    moved = make_bundle("moved", change=move)
+    assert command("verify-bundle", moved)[0] == 0
+    code, out, err = command("verify-bundle", moved, "--self-test")
+    assert (code, out) == (1, "")
+    assert "within 1 mm and 1 degree, but the nearest is off by 2.00 mm" in one_sentence(err)
+    assert "(and 3 more)" in err
 
 
 def test_keys_are_made_once(command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,6 +83,7 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     verb = verbs.add_parser("verify-bundle", help="is a bundle whole and signed?", description=_verify_bundle.__doc__)
     verb.add_argument("path", metavar="PATH", help="the bundle's folder")
     _add_key_options(verb)
+    verb.add_argument("--self-test", action="store_true", help="also estimate its golden clouds, as a cell does")
     verb.set_defaults(run=_verify_bundle)
 
     verb = verbs.add_parser("serve", help="the cell's HTTP server", description="Serve a bundle over HTTP.")
@@ -195,11 +196,19 @@ def _verify_bundle(options: argparse.Namespace) -> int:
 
     trusted = _trusted(options)
     bundle = load_bundle(options.path, trusted)
-    signature = "signature not checked" if trusted is None else "signature holds"
-    print(
-        f"{options.path}: {bundle.card.part.name}, bundle {bundle.digest[:12]}: "
-        f"{signature}, every hash holds, {len(bundle.golden())} golden clouds"
-    )
+    clouds = len(bundle.golden())
+    said = "signature not checked" if trusted is None else "signature holds"
+    said += f", every hash holds, golden clouds: {clouds}"
+    if options.self_test:
+        from attentionvote.inference.estimator import PoseEstimator
+        from attentionvote.inference.golden import self_test
+
+        with PoseEstimator(bundle) as estimator:
+            if problems := self_test(estimator, bundle):
+                more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+                raise BundleError(f"{options.path}: {problems[0]}{more}")
+        said += ", all of them reproduced"
+    print(f"{options.path}: {bundle.card.part.name}, bundle {bundle.digest[:12]}: {said}")
     return OK
 
 

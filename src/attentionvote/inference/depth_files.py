@@ -17,7 +17,7 @@ from attentionvote.inference.array_bytes import NPY_MAGIC, array_from_npy
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.file_bytes import file_bytes
 
-MOST_PIXELS = 16_000_000
+MOST_PIXELS = 8_000_000
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
@@ -112,11 +112,6 @@ def read_depth(source: Path | str | bytes, name: str = "") -> NDArray[Any]:
             raise InputError(f"{name} must be a depth image (H, W), got shape {image.shape}")
         return image
     raise InputError(f"{name} must be a 16-bit PNG or a .npy file with a depth image, got another kind of file")
-
-
-def is_depth(content: bytes) -> bool:
-    """Whether a file's content is a PNG, which can only be a depth image."""
-    return content.startswith(PNG_MAGIC)
 
 
 def _png(content: bytes, name: str) -> NDArray[np.uint16]:
