@@ -1,0 +1,110 @@
+"""The containers of docker/compose.yaml: closed down as far as they go, and MLflow's arguments as a real server."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+USER = "65532:65532"
+
+
+@pytest.fixture(scope="module")
+def compose() -> dict[str, Any]:
+    """The file, parsed."""
+    content = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.mark.parametrize("name", ["inference", "mlflow"])
+def test_a_container_may_do_no_more_than_it_must(compose: dict[str, Any], name: str) -> None:
+    service = compose["services"][name]
+    assert service["read_only"] is True
+    assert [entry.split(":")[0] for entry in service["tmpfs"]] == ["/tmp"]
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["pids_limit"] <= 256
+    assert service["mem_limit"] in ("2g", "3g")
+    assert not {"privileged", "cap_add", "network_mode", "pid", "user", "devices"} & set(service)
+    assert all(port.rsplit(":", 2)[0] in ("127.0.0.1", "${CELL_ADDRESS:-127.0.0.1}") for port in service["ports"])
+
+
+def test_the_images_are_built_here_with_fixed_versions(compose: dict[str, Any], stages: dict[str, Any]) -> None:
+    version = (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition('\nversion = "')[2].partition('"')[0]
+    tracking = (ROOT / "constraints.txt").read_text(encoding="utf-8").partition("\nmlflow==")[2].partition("\n")[0]
+    services = compose["services"]
+    assert services["inference"]["image"] == f"attentionvote:{version}"
+    assert services["mlflow"]["image"] == f"attentionvote-mlflow:{tracking}"
+    for service in services.values():
+        build = service["build"]
+        assert (ROOT / "docker" / build["context"]).resolve() == ROOT
+        assert (ROOT / build["dockerfile"]).is_file()
+        assert stages[build["target"]]["USER"] == USER
+
+
+def test_only_the_state_can_be_written(compose: dict[str, Any], stages: dict[str, Any]) -> None:
+    service, image = compose["services"]["inference"], stages["inference"]
+    volumes = {entry.rsplit(":", 1)[-1] if not entry.endswith(":ro") else entry for entry in service["volumes"]}
+    assert volumes == {"/state", "${CELL_BUNDLES:-./cell/bundles}:/bundles:ro"}
+    assert set(service["secrets"]) == set(compose["secrets"]) == {"token", "signing.pub"}
+    words = image["CMD"]
+    given = dict(zip(words[2::2], words[3::2], strict=True))
+    assert words[:2] == ["serve", "/bundles/current"]
+    assert given["--state"] == image["VOLUME"] == "/state"
+    assert (given["--token-file"], given["--key"]) == ("/run/secrets/token", "/run/secrets/signing.pub")
+    assert compose["volumes"].keys() == {"state", "mlflow"}
+    assert compose["services"]["mlflow"]["volumes"] == ["mlflow:/data"]
+
+
+def ask(port: int, host: str) -> int:
+    """The status of a request to MLflow's REST interface under a host name."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    try:
+        connection.request("GET", "/api/2.0/mlflow/experiments/search?max_results=1", headers={"Host": host})
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+@pytest.mark.slow
+def test_mlflow_answers_under_its_name_in_the_network_and_to_no_stranger(
+    compose: dict[str, Any], stages: dict[str, Any], tmp_path: Path, free_port: int
+) -> None:
+    service = compose["services"]["mlflow"]
+    assert service["environment"] == {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+    assert "--serve-artifacts" in service["command"]
+    moved = {"/data": str(tmp_path), "0.0.0.0": "127.0.0.1", "--port=5000": f"--port={free_port}"}
+    words = [*stages["mlflow"]["ENTRYPOINT"], *service["command"]]
+    for before, after in moved.items():
+        assert any(before in word for word in words), before
+        words = [word.replace(before, after) for word in words]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW")}
+    environment |= {k: v for k, v in stages["mlflow"]["ENV"].items() if k.startswith("MLFLOW")} | service["environment"]
+    words[0] = str(Path(sys.executable).parent / words[0])
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen(words, env=environment, cwd=tmp_path, stdout=silent, stderr=silent)
+    try:
+        until = time.monotonic() + 120
+        while True:
+            try:
+                assert ask(free_port, "mlflow:5000") == 200
+                break
+            except ConnectionError:
+                assert process.poll() is None, "the server ended"
+                assert time.monotonic() < until
+                time.sleep(0.3)
+        assert ask(free_port, "localhost:5000") == 200
+        assert ask(free_port, "stranger:5000") == 403
+        assert (tmp_path / "mlflow.db").is_file()
+    finally:
+        process.terminate()
+        process.wait(30)
