@@ -12,7 +12,9 @@ from attentionvote.inference.errors import InputError
 
 MOST_BYTES = 8 * 1024 * 1024
 MOST_DEPTH = 16
-_STRING = re.compile(rb'"(?:[^"\\]|\\.)*"', re.DOTALL)
+# A text without its closing quote reaches to the end: if it did not match, the next quote would be tried, and the
+# next, in quadratic time.
+_STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
 _OPENING, _CLOSING = b"[{", b"]}"
 
 
