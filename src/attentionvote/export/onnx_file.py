@@ -33,9 +33,9 @@ def export_graph(model: AttentionVote, card: ModelCard) -> bytes:
     """
     points, normals = _example(card.points)
     with quiet_exporter(), torch.no_grad():
+        traced = torch.export.export(ExportNetwork(model).eval(), (points, normals), strict=True)
         program = torch.onnx.export(
-            ExportNetwork(model).eval(),
-            (points, normals),
+            traced,
             dynamo=True,
             opset_version=OPSET,
             input_names=list(INPUTS),

@@ -1,0 +1,76 @@
+"""The in-graph sampling and neighbour search in onnxruntime beside the C operators, whose indices they must give."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from attentionvote.export import graph_neighbors
+from attentionvote.export.onnx_file import OPSET, quiet_exporter
+from attentionvote.model import Layout
+from attentionvote.model.neighborhoods import find_neighborhoods
+
+COUNT = 600  # not a multiple of a row of the two-step ArgMax
+LAYOUT = Layout((64, 32, 16, 8), (16, 8, 8, 4), (0.02, 0.04, 0.06, 0.12))
+pytestmark = pytest.mark.slow
+
+
+class Finder(nn.Module):
+    def forward(self, points: Tensor) -> tuple[Tensor, ...]:
+        found = graph_neighbors.find_neighborhoods(points, LAYOUT)
+        return (found.order, *found.neighbors, *found.nearest, *found.weights)
+
+
+@pytest.fixture(scope="module")
+def finder() -> onnxruntime.InferenceSession:
+    with quiet_exporter(), torch.no_grad():
+        program = torch.onnx.export(Finder(), (torch.rand(1, COUNT, 3),), input_names=["points"], opset_version=OPSET)
+    assert program is not None
+    buffer = io.BytesIO()
+    program.save(buffer)
+    return onnxruntime.InferenceSession(buffer.getvalue(), providers=["CPUExecutionProvider"])
+
+
+def cloud(kind: str) -> NDArray[np.float32]:
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-0.1, 0.1, (COUNT, 3)) + [0.0, 0.0, 0.8]
+    if kind == "lattice":  # many equal distances; exact in float32
+        points = rng.integers(-26, 26, (COUNT, 3)) * 2.0**-8 + [0, 0, 0.75]
+    elif kind == "repeated":  # a poor cloud is filled up with repetitions
+        points = points[rng.integers(0, 40, COUNT)]
+    elif kind == "sparse":  # balls that hold their centre only
+        points = points * [10, 10, 1]
+    elif kind == "one place":
+        points = np.full((COUNT, 3), 0.5)
+    return points.astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "lattice", "repeated", "sparse", "one place"])
+def test_the_graph_finds_what_the_operators_find(finder: onnxruntime.InferenceSession, kind: str) -> None:
+    points = cloud(kind)
+    order, *rest = (a[0] for a in finder.run(None, {"points": points[None]}))
+    expected = find_neighborhoods(points, LAYOUT)
+    np.testing.assert_array_equal(order, expected.order)
+    for actual, neighbors in zip(rest[:4], expected.neighbors, strict=True):
+        np.testing.assert_array_equal(actual, neighbors)
+    for actual, nearest in zip(rest[4:6], expected.nearest, strict=True):
+        np.testing.assert_array_equal(actual, nearest)
+    for actual, weights in zip(rest[6:], expected.weights, strict=True):
+        np.testing.assert_allclose(actual, weights, atol=2e-6)
+
+
+def test_far_from_the_origin_a_ball_keeps_its_points_but_for_rounding(finder: onnxruntime.InferenceSession) -> None:
+    """Two metres away float32 has steps of 0.1 micrometres: only points that near the edge of a ball may change sides."""
+    points = cloud("uniform") + np.float32([1.0, -1.0, 2.0])
+    _, first, *_ = (a[0] for a in finder.run(None, {"points": points[None]}))
+    expected = find_neighborhoods(points, LAYOUT).neighbors[0].numpy()
+    centers = points[find_neighborhoods(points, LAYOUT).order].astype(np.float64)
+    distance = np.linalg.norm(points[first].astype(np.float64) - centers[:, None], axis=-1)
+    assert distance.max() < LAYOUT.radii[0] * (1 + 1e-4)
+    assert (first == expected).all(axis=1).mean() > 0.95

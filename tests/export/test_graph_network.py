@@ -1,0 +1,76 @@
+"""The exported graph in onnxruntime beside the network it was made of."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from attentionvote.contract import ModelCard
+from attentionvote.export.graph_network import ExportNetwork
+from attentionvote.inference.runtime import Session
+from attentionvote.model import AttentionVote, Predictions
+from attentionvote.model.backbone import SetAbstraction
+from attentionvote.model.refinement import Refiner
+
+Cloud = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+def test_the_given_network_is_not_changed_and_shares_its_weights(network: AttentionVote) -> None:
+    twin = ExportNetwork(network).model
+    assert all(isinstance(layer, SetAbstraction) for layer in network.backbone.abstractions)
+    assert all(isinstance(layer, Refiner) for layer in network.refiners)
+    theirs = {p.data_ptr() for p in network.parameters()}
+    assert {p.data_ptr() for p in twin.parameters()} == theirs
+
+
+@pytest.fixture(scope="module")
+def session(graph: bytes, card: ModelCard) -> Session:
+    return Session(graph, card)
+
+
+def answers(network: AttentionVote, session: Session, cloud: Cloud) -> tuple[Predictions, dict[str, NDArray]]:
+    points, normals = (a[None] for a in cloud)
+    with torch.no_grad():
+        return network(torch.from_numpy(points), torch.from_numpy(normals)), session.run(points, normals)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_every_output_is_the_networks(
+    network: AttentionVote, session: Session, make_cloud: Callable[..., Cloud], seed: int
+) -> None:
+    expected, actual = answers(network, session, make_cloud(seed))
+    assert (expected.peak_heat > 0).sum() >= 2
+    assert len(set(np.round(expected.confidence[0].numpy(), 4))) > 2
+    for name, value in expected._asdict().items():
+        np.testing.assert_allclose(actual[name], value.numpy(), atol=3e-5, err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distinct", [1, 3, 20])
+def test_poor_clouds_are_answered_alike_and_finitely(
+    network: AttentionVote, session: Session, make_cloud: Callable[..., Cloud], distinct: int
+) -> None:
+    """A sample with repetitions: distances of zero everywhere, boxes without points."""
+    points, normals = make_cloud(3)
+    chosen = np.random.default_rng(0).integers(0, distinct, len(points))
+    expected, actual = answers(network, session, (points[chosen], normals[chosen]))
+    for name, value in expected._asdict().items():
+        assert np.isfinite(actual[name]).all(), name
+        np.testing.assert_allclose(actual[name], value.numpy(), atol=3e-5, err_msg=name)
+
+
+@pytest.mark.slow
+def test_the_graph_has_no_loose_ends(graph: bytes) -> None:
+    """Weights lie inside, nothing points at this machine, and loops are Scans (a Loop would carry its own counter)."""
+    model = onnx.load(io.BytesIO(graph))
+    assert not any(t.data_location == onnx.TensorProto.EXTERNAL for t in model.graph.initializer)
+    assert {n.op_type for n in model.graph.node} >= {"Scan", "TopK", "Gemm"}
+    assert b".py" not in graph
+    assert b"site-packages" not in graph

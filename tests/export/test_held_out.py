@@ -1,0 +1,113 @@
+"""Scenes a training never saw: found by their digest, spread over the cycles, measured as the training did."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from attentionvote.export import held_out, model_card
+from attentionvote.model import AttentionVote
+from attentionvote.part import Part
+from attentionvote.simulation import PartCaster, SceneSet, scene_set, scene_set_directory, scene_set_specs
+
+CAMERA = {"width": 344, "height": 257, "fx": 567.0, "fy": 567.0, "cx": 172.0, "cy": 128.5}
+SETTINGS: dict[str, Any] = {
+    "seed": 3,
+    "cycles": {"train": 1, "test": 2},
+    "drop_counts": [1, 2],
+    "bin": {"size": None, "jitter": 0.1},
+    "camera": {
+        "camera": CAMERA, "distance": None, "distance_jitter": 0.05, "shift": 0.01, "tilt_degrees": 3.0,
+        "roll_degrees": 10.0,
+    },
+    "drop": {
+        "timestep": 0.008, "contact_time": 0.02, "friction": [0.2, 0.6], "hull_threshold": 0.1, "hull_vertices": 64,
+        "speed": 0.5, "timeout": 1.5,
+    },
+    "visibility_stride": 4,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def root(part: Part, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with the train and test scenes of a brick."""
+    folder = tmp_path_factory.mktemp("data")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_set, "convex_hulls", lambda p, *_: (p.vertices[ConvexHull(p.vertices).vertices],))
+        for spec in scene_set_specs(part, SETTINGS).values():
+            directory = scene_set_directory(folder / "scenes", part.name, spec)
+            scene_set.generate_scene_set(part, spec, directory, progress=False)
+    return folder
+
+
+@pytest.fixture
+def metadata(root: Path, part: Part, make_metadata: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+    digest = SceneSet.open(next((root / "scenes" / part.name).glob("test-*"))).digest
+    return make_metadata(data={"test": digest})
+
+
+def test_the_scenes_are_found_by_their_content(root: Path, part: Part, metadata: dict[str, Any]) -> None:
+    scenes = held_out.find_test_scenes(metadata, part, root)
+    assert scenes.directory.name.startswith("test-")
+    assert len(scenes) == 4
+
+
+def test_other_scenes_and_other_parts_are_not_taken(root: Path, part: Part, metadata: dict[str, Any]) -> None:
+    gone = metadata | {"data": {"test": "f" * 64}}
+    with pytest.raises(ValueError, match=r"the test scenes ffffffffffff of the training must lie below .*, or train"):
+        held_out.find_test_scenes(gone, part, root)
+    with pytest.raises(ValueError, match="brick must be the part the network was trained for .* has changed"):
+        held_out.find_test_scenes(metadata, replace(part, diameter=0.05), root)
+
+
+def test_an_unfinished_set_is_passed_over(root: Path, part: Part, metadata: dict[str, Any], tmp_path: Path) -> None:
+    folder = tmp_path / "scenes" / part.name / "test-unfinished"
+    folder.mkdir(parents=True)
+    found = held_out.find_test_scenes(metadata, part, root)
+    manifest = json.loads((found.directory / "manifest.json").read_text(encoding="utf-8"))
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"content_digest": None}), encoding="utf-8")
+    with pytest.raises(ValueError, match="must lie below"):
+        held_out.find_test_scenes(metadata, part, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("total", "count", "expected"),
+    [(10, 3, [0, 4, 9]), (3, 5, [0, 1, 2]), (1, 4, [0]), (100, 2, [0, 99])],
+)
+def test_a_choice_is_spread_over_all(total: int, count: int, expected: list[int]) -> None:
+    assert held_out.spread(total, count) == expected
+
+
+def test_samples_and_sensor_clouds_are_of_the_same_measurement(
+    root: Path, part: Part, metadata: dict[str, Any], network: AttentionVote
+) -> None:
+    scenes = held_out.find_test_scenes(metadata, part, root)
+    settings = held_out.cloud_settings(metadata)
+    clouds = held_out.measured(scenes, part, settings, root, workers=1)
+    drawn = list(held_out.samples(clouds, [1, 3], 300, network.layout))
+    again = list(held_out.samples(clouds, [3], 300, network.layout))
+    assert [d.points.shape for d in drawn] == [(1, 300, 3)] * 2
+    np.testing.assert_array_equal(drawn[1].points, again[0].points)
+    whole = held_out.sensor_cloud(scenes, 3, PartCaster(part), settings)
+    assert 500 < len(whole) <= settings.density
+    sampled = {tuple(p) for p in drawn[1].points[0].numpy().tolist()}
+    assert sampled <= {tuple(p) for p in whole.tolist()}
+    (near, far), extent = held_out.working_volume(clouds)
+    low, high = whole.min(0), whole.max(0)
+    assert near <= low[2] + 0.002 < high[2] - 0.002 <= far
+    assert extent >= (high - low).max() - 0.002
+    card = model_card(network, metadata, part, (near, far), extent, "run", "commit")
+    assert (card.points, card.votes, card.proposals, card.density) == (300, 32, 8, 2000)
+    assert type(card).from_json(card.to_json()) == card
+
+
+def test_a_card_needs_a_finished_training(network: AttentionVote, metadata: dict[str, Any], part: Part) -> None:
+    with pytest.raises(ValueError, match="must be of a finished training"):
+        model_card(network, metadata | {"confidence_threshold": None}, part, (0.5, 0.6), 0.2)
