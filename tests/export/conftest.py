@@ -103,7 +103,7 @@ def pile(part: Part, seed: int, count: int = POINTS) -> Cloud:
     """Surface points of three parts half a metre away, with unit normals of no meaning."""
     rng = np.random.default_rng(seed)
     surface = part.surface_points(count, rng)
-    shift = rng.uniform(-part.diameter, part.diameter, (3, 3)) + [0, 0, 0.5]
+    shift = rng.uniform(-part.diameter, part.diameter, (3, 3)) + np.array([0, 0, 0.5])
     points = (surface + shift[rng.integers(0, 3, count)]).astype(np.float32)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""``export_script.py MODEL CARD OUT`` exports a checkpoint: in a process without the shape checks, which cannot be traced."""
+"""``export_script.py MODEL CARD OUT``: export in a process without the shape checks, which cannot be traced."""
 
 import sys
 from pathlib import Path

@@ -1,0 +1,171 @@
+"""The verb export: from a training's folder to a signed bundle, once, and nothing but a report where the proof fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import export
+import pytest
+import torch
+from configuration import ConfigurationError, compose
+
+from attentionvote.inference import load_bundle
+from attentionvote.model import AttentionVote
+from attentionvote.training.checkpoint import load_trained, save_trained
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES = [
+    "object=brick",
+    "simulation=smoke",
+    "simulation.cycles={train:1,val:1,test:2}",
+    "simulation.drop_counts=[2,4]",
+]
+EXPORT = ["object=brick", "limits.scenes=2", "scenes=4", "golden=2", "workers=1"]
+
+
+def python(script: str, *words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A pipeline in a process of its own, with keys in ``folder``."""
+    environment = os.environ | {"ATTENTIONVOTE_KEYS": str(folder / "keys")}
+    command = [sys.executable, str(ROOT / "pipelines" / script), *words]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=280, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with scenes of bricks and a training of a small network that votes near its seeds."""
+    from dataclasses import asdict
+
+    from attentionvote.simulation import SceneSet, load_part
+
+    folder = tmp_path_factory.mktemp("trained")
+    done = python("generate.py", *SCENES, "splits=[test]", "workers=1", folder=folder)
+    assert done.returncode == 0, done.stderr
+    part = load_part("brick", "builtin:brick")
+    network: dict[str, Any] = {
+        "diameter": float(part.diameter), "box": [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()],
+        "centers": [64, 32, 16, 8], "neighbors": [16, 8, 8, 4], "widths": [[8, 16]] + [[16, 16]] * 3,
+        "propagation": [16, 16], "residual": True, "radius_fraction": 0.2, "voxel_fraction": 0.2, "voting": [16],
+        "proposals": 8, "gathered": 8, "fusion": [16, 16], "head": [16], "rotation": "six", "confidence": "quality",
+        "center_seed": "mean", "vote_rotation": True, "merge_fraction": 0.08,
+        "refinement": {"points": 24, "widths": [8, 16], "head": [16]},
+    }  # fmt: skip
+    torch.manual_seed(0)
+    scenes = SceneSet.open(next((folder / "data" / "scenes" / "brick").glob("test-*")))
+    metadata = {
+        "format": 1, "version": "0.1.0", "model": network,
+        "part": {
+            "name": "brick", "title": part.title, "diameter": float(part.diameter), "digest": part.digest,
+            "symmetry": json.loads(json.dumps(asdict(part.symmetry))),
+        },
+        "points": 400,
+        "clouds": {"sensor": {"preset": "gaussian", "sigma_mm": 0.1}, "density": 2000, "pool": 1000, "neighbors": 12},
+        "peak_threshold": 0.05, "confidence_threshold": 0.1, "data": {"test": scenes.digest}, "test": {"ap_10": 0.1},
+    }  # fmt: skip
+    training = folder / "outputs" / "train" / "brick" / "0123456789ab"
+    save_trained(AttentionVote(**network).eval(), metadata, training / "model.ckpt")
+    (training / "result.json").write_text(json.dumps({"run_id": "feed" * 8, "commit": "c" * 40}), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(trained: Path) -> dict[str, Any]:
+    done = python("export.py", *EXPORT, "triton=triton", folder=trained)
+    assert done.returncode == 0, done.stderr
+    assert "matched poses" in done.stderr
+    assert len(done.stdout.splitlines()) == 1
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+@pytest.mark.slow
+def test_a_training_becomes_a_bundle_that_a_cell_trusts(trained: Path, exported: dict[str, Any]) -> None:
+    latest = trained / "outputs" / "export" / "brick" / "latest"
+    bundle = load_bundle(latest, trained / "keys" / "signing.pub")
+    assert latest.resolve() == (trained / exported["bundle"]).resolve()
+    assert bundle.digest == exported["digest"]
+    card = bundle.card
+    assert (card.run_id, card.commit, card.evaluation) == ("feed" * 8, "c" * 40, {"ap_10": 0.1})
+    assert card.parity["CPU"] == exported["parity"]["CPU"]
+    assert exported["parity"]["CPU"]["scenes"] == 4
+    assert exported["parity"]["CPU"]["pairs"] > 4
+    assert len(bundle.golden()) == 2
+    assert (trained / "triton" / "brick" / "1" / "model.onnx").read_bytes() == bundle.model
+    assert exported["milliseconds"]["CPU"] > 0
+
+
+@pytest.mark.slow
+def test_what_is_done_is_not_done_again(trained: Path, exported: dict[str, Any]) -> None:
+    done = python("export.py", *EXPORT, "triton=triton", folder=trained)
+    assert done.returncode == 0, done.stderr
+    assert "this export is done (force=true repeats it)" in done.stderr
+    assert json.loads(done.stdout) == exported
+
+
+@pytest.mark.slow
+def test_over_the_limits_only_the_report_is_written(
+    trained: Path, exported: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The graph of one network cannot pass for another: the checkpoint is changed after its export."""
+    import attentionvote.export
+
+    stored = load_bundle(trained / exported["bundle"], None).model
+    training = tmp_path / "train" / "brick" / "abcdefabcdef"
+    model, metadata = load_trained(trained / "outputs/train/brick/0123456789ab/model.ckpt")
+    with torch.no_grad():
+        model.output.bias[:3] += 0.5
+        for refiner in model.refiners:
+            refiner.output.bias[:3] += 0.2  # type: ignore[index, union-attr]
+    save_trained(model, metadata, training / "model.ckpt")
+    (training / "result.json").write_text(json.dumps({"run_id": "f00d", "commit": ""}), encoding="utf-8")
+    monkeypatch.setattr(attentionvote.export, "export_graph", lambda *_: stored)
+    words = [f"root={trained}/data", f"trained={tmp_path}/train", f"outputs={tmp_path}/export"]
+    cfg = compose("export", [*EXPORT, *words, f"signing_keys={trained}/keys"])
+    with pytest.raises(
+        ValueError, match=r"graph and checkpoint must be equal within the limits, but CPU: .*the report"
+    ):
+        export.run(cfg)
+    written = [p.relative_to(tmp_path / "export").as_posix() for p in (tmp_path / "export").rglob("*") if p.is_file()]
+    assert written == ["brick/parity-abcdefabcdef.json"]
+    report = json.loads((tmp_path / "export" / written[0]).read_text(encoding="utf-8"))
+    assert report["paths"]["CPU"]["scenes"] == 4
+
+
+@pytest.fixture
+def two_trainings(tmp_path: Path) -> list[str]:
+    for name, run_id in (("aaaa11112222", "cafe1"), ("aaaa33334444", "cafe2")):
+        folder = tmp_path / "train" / "brick" / name
+        folder.mkdir(parents=True)
+        (folder / "model.ckpt").touch()
+        (folder / "result.json").write_text(json.dumps({"run_id": run_id}), encoding="utf-8")
+    return [*EXPORT, f"trained={tmp_path}/train", f"outputs={tmp_path}/export", f"signing_keys={tmp_path}/keys"]
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("run=cafe", "run must name one complete training, 'cafe' names 2; there are aaaa11112222 (run cafe1), aaaa"),
+        ("run=dead", "run must name one complete training, 'dead' names 0"),
+        ("trained=nowhere", "nowhere/brick must hold a complete training, got none: run `make train OBJECT=brick`"),
+        ("scenes=1", "scenes must be at least limits.scenes (2), got 1"),
+    ],
+)
+def test_a_training_that_cannot_be_meant_is_one_sentence(two_trainings: list[str], word: str, message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        export.run(compose("export", [*two_trainings, word]))
+    assert message in str(caught.value)
+
+
+def test_a_run_is_named_by_the_beginning_of_its_id_or_folder(two_trainings: list[str]) -> None:
+    from export_job import ExportJob
+
+    find: Callable[[str], Path] = lambda word: ExportJob.find(compose("export", [*two_trainings, word])).training  # noqa: E731
+    assert find("run=cafe1").name == "aaaa11112222"
+    assert find("run=aaaa3").name == "aaaa33334444"
