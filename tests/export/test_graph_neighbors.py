@@ -39,7 +39,7 @@ def finder() -> onnxruntime.InferenceSession:
 
 def cloud(kind: str) -> NDArray[np.float32]:
     rng = np.random.default_rng(7)
-    points = rng.uniform(-0.1, 0.1, (COUNT, 3)) + [0.0, 0.0, 0.8]
+    points = rng.uniform(-0.1, 0.1, (COUNT, 3)) + np.array([0.0, 0.0, 0.8])
     if kind == "lattice":  # many equal distances; exact in float32
         points = rng.integers(-26, 26, (COUNT, 3)) * 2.0**-8 + [0, 0, 0.75]
     elif kind == "repeated":  # a poor cloud is filled up with repetitions
@@ -66,7 +66,7 @@ def test_the_graph_finds_what_the_operators_find(finder: onnxruntime.InferenceSe
 
 
 def test_far_from_the_origin_a_ball_keeps_its_points_but_for_rounding(finder: onnxruntime.InferenceSession) -> None:
-    """Two metres away float32 has steps of 0.1 micrometres: only points that near the edge of a ball may change sides."""
+    """Two metres away float32 has steps of 0.1 micrometres: points so near the edge of a ball may change sides."""
     points = cloud("uniform") + np.float32([1.0, -1.0, 2.0])
     _, first, *_ = (a[0] for a in finder.run(None, {"points": points[None]}))
     expected = find_neighborhoods(points, LAYOUT).neighbors[0].numpy()

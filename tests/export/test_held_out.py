@@ -63,7 +63,7 @@ def test_other_scenes_and_other_parts_are_not_taken(root: Path, part: Part, meta
     gone = metadata | {"data": {"test": "f" * 64}}
     with pytest.raises(ValueError, match=r"the test scenes ffffffffffff of the training must lie below .*, or train"):
         held_out.find_test_scenes(gone, part, root)
-    with pytest.raises(ValueError, match="brick must be the part the network was trained for .* has changed"):
+    with pytest.raises(ValueError, match=r"brick must be the part the network was trained for .* has changed"):
         held_out.find_test_scenes(metadata, replace(part, diameter=0.05), root)
 
 
