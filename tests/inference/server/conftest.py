@@ -106,7 +106,7 @@ class ServerProcess:
         until = time.monotonic() + patience_s
         while not condition():
             if time.monotonic() > until or self.process.poll() is not None:
-                log = self.log_file.read_text(encoding="utf-8")
+                log = "\n".join(json.dumps(line) for line in self.log() if line["event"] != "request")
                 pytest.fail(f"waited in vain until {what} (exit code {self.process.poll()}); log:\n{log}")
             time.sleep(0.02)
 

@@ -44,7 +44,7 @@ class Deadline:
     def exceeded(self, doing: str) -> Refusal:
         """The answer when it has passed while something was done."""
         sentence = f"the deadline of {self.budget_s * 1e3:.0f} ms passed while {doing}: nothing was computed to its end"
-        content = {"status": "deadline_exceeded", "message": sentence, "poses": []}
+        content = {"answer": "abstention", "reason": "deadline_exceeded", "message": sentence, "poses": []}
         return Refusal(504, sentence, "deadline", content=content)
 
 

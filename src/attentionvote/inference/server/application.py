@@ -115,7 +115,7 @@ class _Pages:
         camera = self._cell.camera
         if camera is None:
             raise InputError(
-                "a depth image needs its camera, got one without: start the server with --cell and a camera"
+                "a depth image needs its camera, got none: start the server with --cell and a camera in it"
             )
         return Question({"depth": read_depth(body, "the body"), "camera": camera})
 
@@ -125,7 +125,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     path = request.url.path
     if error.status_code == 405:
-        allowed = (error.headers or {}).get("Allow", "another")
+        allowed = ", ".join(sorted((error.headers or {}).get("Allow", "another").split(", ")))
         sentence = f"the method for {path[:80]} must be {allowed}, got {request.method}"
         refusal = Refusal(405, sentence, "rejected", {"Allow": allowed})
     elif error.status_code == 404:
