@@ -88,7 +88,7 @@ class Cell:
     """What is mounted, and one question with its answer.
 
     Attributes:
-        bundles: folder with a bundle and ``current``, a link to it.
+        bundles: folder with a bundle and ``latest``, a link to it.
         secrets: folder with ``signing.pub`` and ``token``.
         token: the token's text.
         cloud: ``(P, 3)`` points, metres.
@@ -163,7 +163,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
         confidence=np.array([found.confidence for found in golden], np.float32),
     )
     write_manifest(bundle, load_private_key(private))
-    (folder / "bundles" / "current").symlink_to("bracket")
+    (folder / "bundles" / "latest").symlink_to("bracket")
     (secrets / "signing.pub").write_bytes(public.read_bytes())
     token = os.urandom(20).hex()
     (secrets / "token").write_text(token, encoding="utf-8")

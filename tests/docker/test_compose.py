@@ -58,7 +58,7 @@ def test_only_the_state_can_be_written(compose: dict[str, Any], stages: dict[str
     assert set(service["secrets"]) == set(compose["secrets"]) == {"token", "signing.pub"}
     words = image["CMD"]
     given = dict(zip(words[2::2], words[3::2], strict=True))
-    assert words[:2] == ["serve", "/bundles/current"]
+    assert words[:2] == ["serve", "/bundles/latest"]
     assert given["--state"] == image["VOLUME"] == "/state"
     assert (given["--token-file"], given["--key"]) == ("/run/secrets/token", "/run/secrets/signing.pub")
     assert compose["volumes"].keys() == {"state", "mlflow"}

@@ -46,3 +46,10 @@ def test_what_is_copied_exists_and_passes_the_ignore_file(stages: Stages) -> Non
     for name in names:
         assert (ROOT / name).exists(), name
         assert any(fnmatch(name, rule) or name.startswith(f"{rule}/") for rule in allowed), name
+
+
+def test_a_cells_token_reaches_neither_the_images_nor_git() -> None:
+    """compose.yaml looks for it in docker/cell, which is below what the images may see."""
+    assert "/cell/" in (ROOT / "docker" / ".gitignore").read_text(encoding="utf-8").splitlines()
+    rules = (ROOT / "docker" / "Dockerfile.dockerignore").read_text(encoding="utf-8").splitlines()
+    assert rules.index("docker/cell") > rules.index("!docker")

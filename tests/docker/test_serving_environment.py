@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from conftest import Cell
 
 ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> str:
@@ -40,7 +40,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory, wheels: Path) -> Path:
     target = folder / "environment"
     run(sys.executable, "-m", "venv", "--without-pip", target)
     pip = [sys.executable, "-m", "pip", "--python", str(target / "bin" / "python"), "--disable-pip-version-check"]
-    offline = ("--quiet", "--no-index", "--find-links", wheels, "--no-deps")
+    offline = ("--quiet", "--no-compile", "--no-index", "--find-links", wheels, "--no-deps")
     run(*pip, "install", *offline, "--require-hashes", "-r", ROOT / "docker" / "requirements.txt")
     run(*pip, "install", *offline, source)
     assert "No broken requirements found." in run(*pip, "check")

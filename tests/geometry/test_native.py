@@ -31,6 +31,24 @@ def test_a_library_is_compiled_once_and_kept(empty_cache: Path) -> None:
     assert kept.stat().st_mtime_ns == changed
 
 
+def test_a_library_made_elsewhere_needs_neither_compiler_nor_a_writable_folder(
+    empty_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if native.shutil.which("cc") is None:
+        pytest.skip("no C compiler on this machine")
+    assert native.load("attentionvote.geometry", "pointops.c") is not None
+    native.compiled.cache_clear()
+    monkeypatch.setattr(native.shutil, "which", lambda _: None)
+    monkeypatch.setattr(native, "_writable", lambda _: False)  # root may write anywhere
+    empty_cache.chmod(0o555)
+    try:
+        before = sorted((p.name, p.stat().st_mtime_ns) for p in empty_cache.iterdir())
+        assert native.load("attentionvote.geometry", "pointops.c") is not None
+        assert sorted((p.name, p.stat().st_mtime_ns) for p in empty_cache.iterdir()) == before
+    finally:
+        empty_cache.chmod(0o755)
+
+
 @pytest.mark.usefixtures("empty_cache")
 def test_without_a_compiler_there_is_no_library_and_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native.shutil, "which", lambda _: None)
