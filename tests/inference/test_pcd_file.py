@@ -128,9 +128,6 @@ LYING = [
     PCD.replace(b" 50\n", b" 4000000\n"),
     pcd(POINTS, "ascii").replace(b" 50\n", b" 4000000\n"),
     PACKED.replace(b" 50\n", b" 4000000\n").replace(struct.pack("<I", 600), struct.pack("<I", 48_000_000)),
-    PACKED.replace(b" 50\n", b" 4000000\n")
-    .replace(b"COUNT 1 1 1", b"COUNT 1 1 80")
-    .replace(struct.pack("<I", 600), struct.pack("<I", 1_312_000_000)),
 ]
 
 
@@ -145,6 +142,16 @@ def test_a_lying_header_reserves_no_memory_and_takes_no_time(content: bytes) -> 
     finally:
         tracemalloc.stop()
     assert time.process_time() - start < 2
+
+
+def test_coordinates_far_behind_in_packed_data_are_refused_before_anything_is_unpacked() -> None:
+    far = (
+        PACKED.replace(b" 50\n", b" 4000000\n")
+        .replace(b"COUNT 1 1 1", b"COUNT 1 1 80")
+        .replace(struct.pack("<I", 600), struct.pack("<I", 1_312_000_000))
+    )
+    with pytest.raises(InputError, match="its coordinates must lie within 100663296 unpacked bytes, got 1312000000"):
+        read_cloud(far)
 
 
 def test_packed_data_that_are_larger_than_unpacked_ones_are_refused() -> None:

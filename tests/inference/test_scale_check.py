@@ -62,6 +62,17 @@ def test_less_than_a_factor_of_five_is_not_refused(make_card: MakeCard, make_clo
         assert warnings
 
 
+@pytest.mark.parametrize(("depth", "refused"), [(4.9, False), (5.2, True), (0.6 / 4.8, False), (0.6 / 5.2, True)])
+def test_a_factor_of_five_is_refused(make_card: MakeCard, make_cloud: MakeCloud, depth: float, refused: bool) -> None:
+    cloud = make_cloud(center=(0, 0, depth))
+    check_unit(cloud, make_card())
+    if refused:
+        with pytest.raises(InputError, match="points must be metres"):
+            check_scene(cloud, make_card())
+    else:
+        assert len(check_scene(cloud, make_card())) == 1
+
+
 def test_an_unusual_scene_is_warned_about_in_words(make_card: MakeCard, make_cloud: MakeCloud) -> None:
     far, near = make_cloud(center=(0, 0, 2.0)), make_cloud(center=(0, 0, 0.3))
     assert "lies farther than trained: the cloud is" in check_scene(far, make_card())[0]

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.signature import (
+    _create,
     fingerprint,
     keys_folder,
     load_private_key,
@@ -35,6 +36,7 @@ def test_keys_are_a_pair_and_the_private_one_is_its_owners(tmp_path: Path) -> No
     private, public = make_keys(tmp_path / "new" / "keys")
     assert (private.name, public.name) == ("signing.key", "signing.pub")
     assert stat.S_IMODE(private.stat().st_mode) == 0o600
+    assert stat.S_IMODE(public.stat().st_mode) == 0o644
     assert stat.S_IMODE(private.parent.stat().st_mode) == 0o700
     assert private.read_bytes().startswith(b"-----BEGIN PRIVATE KEY-----")
     verify(DATA, sign(DATA, load_private_key(private)), load_public_key(public))
@@ -49,6 +51,14 @@ def test_keys_are_never_overwritten(tmp_path: Path) -> None:
     ):
         make_keys(tmp_path)
     assert (private.read_bytes(), public.read_bytes()) == before
+
+
+def test_a_file_that_appears_meanwhile_is_left_as_it_is(tmp_path: Path) -> None:
+    # The other process wrote its key between this one's look and its own writing.
+    (tmp_path / "signing.key").write_text("theirs")
+    assert not _create(tmp_path / "signing.key", b"mine", 0o600)
+    assert (tmp_path / "signing.key").read_text() == "theirs"
+    assert [p.name for p in tmp_path.iterdir()] == ["signing.key"]
 
 
 def test_a_lost_public_key_comes_back_and_a_lost_private_one_does_not(tmp_path: Path) -> None:
