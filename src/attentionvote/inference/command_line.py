@@ -1,4 +1,4 @@
-"""``attentionvote`` on a cell's command line: estimate a file, verify a bundle, serve it, make keys.
+"""``attentionvote`` on a cell's command line: estimate a file, verify a bundle, serve it, ask its health, make keys.
 
 Results go to stdout, everything else to stderr as one sentence. Exit codes: 0 done, 1 the bundle or the machine is at
 fault, 2 the input or the command is, 130 interrupted. Heavy imports stand where they are used: ``--help`` is instant.
@@ -92,6 +92,13 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
         serve.add_arguments(verb)
         verb.set_defaults(run=serve.run)
+
+    verb = verbs.add_parser("health", help="is a server ready? exit code 0 or 1", description="Ask a server.")
+    if words[:1] == ["health"]:
+        from attentionvote.inference.server import health
+
+        health.add_arguments(verb)
+        verb.set_defaults(run=health.run)
 
     verb = verbs.add_parser("keys", help="make the key pair that signs bundles", description=_keys.__doc__)
     verb.add_argument("--folder", metavar="PATH", help="default: $ATTENTIONVOTE_KEYS or ~/.config/attentionvote")

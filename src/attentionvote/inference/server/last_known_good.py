@@ -111,8 +111,9 @@ class LastKnownGood:
                     raise OSError(f"{source} was exchanged while it was copied")
                 os.rename(staging, target)
         _sync(self._kept)
-        damaged = [p for p in entries if p.name.endswith(target.name[9:])]
-        for old in {*self.entries()[KEPT:], *damaged} - {target}:
+        damaged = {p for p in entries if p.name.endswith(target.name[9:])} - {target}
+        others = [p for p in self.entries() if p not in damaged]
+        for old in [*damaged, *others[KEPT:]]:
             with suppress(OSError), self._staging() as staging:
                 os.rename(old, staging / old.name)  # so that half a copy never stands among the whole ones
 

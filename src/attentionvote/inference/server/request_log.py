@@ -75,9 +75,8 @@ class RequestLog:
             return
         given = headers.get("authorization")
         if not self._tokens.accept(given):
-            what = (
-                "none" if given is None else "another one" if given.lower().startswith("bearer ") else "another scheme"
-            )
+            what = "another token" if (given or "").lower().startswith("bearer ") else "another scheme"
+            what = what if given is not None else "none"
             raise Refusal(
                 401,
                 f"the header Authorization must be 'Bearer' and the token of the server's token file, got {what}",
