@@ -7,6 +7,7 @@ version=$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 image="${1:-attentionvote:$version}"
 [ $# -eq 0 ] || shift
 revision=$(git rev-parse HEAD 2>/dev/null || echo unknown)
+[ "$revision" = unknown ] || git diff --quiet HEAD || revision="$revision+dirty"
 [ -z "${BASE:-}" ] || set -- --build-arg "BASE=$BASE" "$@"
 [ -z "${PIP_CONF:-}" ] || set -- --secret "id=pip,src=$PIP_CONF" "$@"
 set -- --build-arg "VERSION=$version" --build-arg "REVISION=$revision" -f docker/Dockerfile -t "$image" "$@" .

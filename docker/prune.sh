@@ -50,7 +50,7 @@ system() {
         adduser passwd login libsemanage2 libsemanage-common libsepol2 \
         e2fsprogs logsave libext2fs2 libss2 mount perl-base; do
         if dpkg-query -W "$package" >/dev/null 2>&1; then
-            dpkg --purge --force-all "$package" >/dev/null 2>&1
+            said=$(dpkg --purge --force-all "$package" 2>&1) || { echo "$said" >&2; exit 1; }
         fi
     done
     # Tables of iconv(); Python brings its own codecs.
