@@ -87,7 +87,9 @@ def test_answers_tokens_and_refusals(
     with PoseEstimator(bundle_folder, trusted=trusted_key) as estimator:
         expected = estimator.estimate(cloud)
     assert isinstance(expected, Estimate)
-    with serving(bundle_folder, trusted_key, tmp_path, "--token-file", str(token)) as url:
+    large = np.full((2_000_000, 3), 0.8, np.float32)
+    options = ("--token-file", str(token), "--max-body-mb", "1")
+    with serving(bundle_folder, trusted_key, tmp_path, *options) as url:
         with PoseClient(url, token=TOKEN) as client:
             # Asked before the model is ready: it waits for it.
             answer = client.estimate(cloud)
@@ -105,7 +107,10 @@ def test_answers_tokens_and_refusals(
             assert empty.camera_from_part.shape == (0, 4, 4)
             with pytest.raises(Rejected, match="were millimetres sent"):
                 client.estimate(cloud * 1000)
-            client.estimate(cloud)  # the connection is still good
+            # Refused before it was received: the sentence arrives all the same, and the connection is still good.
+            with pytest.raises(Rejected, match="the body must have at most 1048576 bytes, got 24000"):
+                client.estimate(large)
+            client.estimate(cloud)
             with pytest.raises(DeadlinePassed, match="deadline"):
                 client.estimate(cloud, deadline_ms=1)
         with PoseClient(url, token="wrong-" + TOKEN) as client:
@@ -113,6 +118,9 @@ def test_answers_tokens_and_refusals(
                 client.estimate(cloud)
             with pytest.raises(Unauthorized):
                 client.metadata()
+        with PoseClient(url, token="wrong-" + TOKEN, part="bracket") as client:
+            with pytest.raises(Unauthorized, match="got another token"):
+                client.estimate(large)
             assert client.ready()  # health is open
         told = pytest.raises(Rejected, match="got 'braket', did you mean 'bracket'")
         with PoseClient(url, token=TOKEN, part="braket") as client, told:

@@ -131,6 +131,18 @@ def test_sigterm_drains_and_ends_with_0(start_server: Any, make_bundle: Any, mak
         server.get("/v2/health/live")
 
 
+def test_a_thread_that_hangs_does_not_keep_the_process() -> None:
+    program = """
+import threading, time
+from attentionvote.inference.server.serve import _leave
+threading.Thread(target=time.sleep, args=(100,), name="stuck").start()
+_leave(None)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    assert "the thread stuck does not end and is left" in done.stderr
+
+
 def test_tls_and_token_end_to_end(
     start_server: Any, bundle_folder: Path, make_cloud: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

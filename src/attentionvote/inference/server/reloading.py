@@ -181,5 +181,6 @@ class BundleWatch:
 
 
 def _be_polite() -> None:
-    with suppress(OSError, AttributeError):  # a thread of its own for the scheduler, on Linux
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+    thread = threading.get_native_id()  # Linux schedules threads like processes
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19))
