@@ -20,6 +20,7 @@ from torch._higher_order_ops.scan import scan
 from attentionvote.model import Layout, Neighborhoods
 
 _ROW = 256  # points a row of the two-step ArgMax
+SPARE = 8  # candidates beyond those wanted: more than ever lie on the edge of a ball
 CHUNK = 16  # centres a step: their distances stay in the cache
 
 
@@ -51,23 +52,30 @@ def ball_query(
 ) -> Int[Tensor, "centers count"]:
     """The first ``count`` points in index order within ``radius`` of each centre, short balls padded with their first.
 
-    Every centre is one of the points, so no ball is empty. ``d^2 - r^2`` of a few centres and all points is one
-    matrix product, half the time of differences and squares; its rounding moves the edge of a ball by at most some
-    millionths of r, as positions are taken from the cloud's middle.
+    Every centre is one of the points, so no ball is empty. One matrix product gives ``d^2 - r^2`` of a few centres and
+    all points, in half the time of differences and squares but with an error of a millionth of the cloud's size
+    squared. So it chooses ``SPARE`` candidates too many from a ball that much larger, and differences and squares
+    decide among these.
     """
-    chunk, most = _divisor(len(centers)), min(count, len(points))
+    chunk = _divisor(len(centers))
+    most, candidates = min(count, len(points)), min(count + SPARE, len(points))
     middle = points.mean(0)
     p, c = points - middle, centers - middle
-    ones = torch.ones(len(points)), torch.ones(len(centers), 1)
-    columns = torch.stack([*p.unbind(-1), ones[0], p.square().sum(-1) - radius * radius])
-    rows = torch.cat([-2 * c, c.square().sum(-1, keepdim=True), ones[1]], dim=-1)
+    squared = p.square().sum(-1)
+    columns = torch.stack([*p.unbind(-1), torch.ones(len(points)), squared - radius * radius - 2e-6 * squared.max()])
+    rows = torch.cat([-2 * c, c.square().sum(-1, keepdim=True), torch.ones(len(centers), 1)], dim=-1)
+    limit = torch.tensor(radius, dtype=torch.float32).square()
 
-    def step(carry: Tensor, block: Tensor) -> tuple[Tensor, Tensor]:
-        beyond = torch.relu(block @ columns)
-        value, index = torch.topk(beyond, most, dim=1, largest=False, sorted=True)
+    def step(carry: Tensor, block: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        row, center = block
+        near = torch.topk(torch.relu(row @ columns), candidates, dim=1, largest=False, sorted=True)[1]
+        dx, dy, dz = (points[near] - center[:, None]).unbind(-1)
+        beyond = torch.relu(dx * dx + dy * dy + dz * dz - limit)
+        value, place = torch.topk(beyond, most, dim=1, largest=False, sorted=True)
+        index = torch.gather(near, 1, place)
         return carry.clone(), torch.where(value > 0, index[:, :1], index)
 
-    _, index = scan(step, torch.zeros(1), rows.view(-1, chunk, 5))
+    _, index = scan(step, torch.zeros(1), (rows.view(-1, chunk, 5), centers.view(-1, chunk, 3)))
     return index.view(len(centers), -1)
 
 
