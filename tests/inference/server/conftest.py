@@ -201,27 +201,43 @@ def start_server(tmp_path: Path, trusted_key: Path) -> Iterator[StartServer]:
 
 
 @pytest.fixture(scope="session")
-def _shared(tmp_path_factory: pytest.TempPathFactory, trusted_key: Path) -> Iterator[_Started]:
-    started = _Started(tmp_path_factory.mktemp("shared-servers"), trusted_key)
+def _shared(tmp_path_factory: pytest.TempPathFactory, trusted_key: Path) -> Iterator[dict[str, _Started]]:
+    all_started = {
+        name: _Started(tmp_path_factory.mktemp(f"{name}-server"), trusted_key) for name in ("shared", "slow")
+    }
     try:
-        yield started
+        yield all_started
     finally:
-        started.end()
-    _no_tracebacks(started)
+        for started in all_started.values():
+            started.end()
+    for started in all_started.values():
+        _no_tracebacks(started)
 
 
 @pytest.fixture
-def shared_server(_shared: _Started, make_bundle: Any) -> ServerProcess:
+def slow_server(_shared: dict[str, _Started], make_bundle: Any) -> ServerProcess:
+    """Shared as well: an estimate takes most of a second, one request may wait, the deadline is 30 s."""
+    started = _shared["slow"]
+    if not started.servers:
+        bundle = make_bundle("slow-bundle", graph={"loops": 400_000})
+        started.start(bundle, "--queue", "1", "--deadline-ms", "30000", "--poll-s", "60")
+    server = started.servers[0]
+    server.wait_until(lambda: server.metric("queue_depth") == 0, "the test before has ended")
+    return server
+
+
+@pytest.fixture
+def shared_server(_shared: dict[str, _Started], make_bundle: Any) -> ServerProcess:
     """A server of the tiny bundle that all tests of the session share: none of them may change it.
 
     It takes bodies of at most 1 MiB and has a camera.
     """
-    if not _shared.servers:
-        cell = _shared.folder / "cell.json"
-        cell.parent.mkdir(parents=True, exist_ok=True)
+    started = _shared["shared"]
+    if not started.servers:
+        cell = started.folder / "cell.json"
         cell.write_text(json.dumps({"camera": {"fx": 300.0, "fy": 300.0, "cx": 79.5, "cy": 59.5}}))
-        _shared.start(make_bundle("shared-bundle"), "--max-body-mb", "1", "--cell", str(cell), "--poll-s", "60")
-    server = _shared.servers[0]
+        started.start(make_bundle("shared-bundle"), "--max-body-mb", "1", "--cell", str(cell), "--poll-s", "60")
+    server = started.servers[0]
     assert server.process.poll() is None, server.log_file.read_text(encoding="utf-8")
     return server
 

@@ -56,14 +56,6 @@ def test_a_depth_image_becomes_poses_through_the_cells_camera(shared_server: Any
     assert answer.json["poses"][1]["position"][0] == pytest.approx(20 / 300 * 0.8, abs=0.02)
 
 
-def test_a_depth_image_without_a_camera_is_refused(start_server: Any, bundle_folder: Any) -> None:
-    stream = io.BytesIO()
-    Image.fromarray(np.full((20, 20), 800, np.uint16)).save(stream, "PNG")
-    reply = start_server(bundle_folder).post("/poses", stream.getvalue())
-    assert reply.status == 400
-    assert reply.error == "a depth image needs its camera, got none: start the server with --cell and a camera in it"
-
-
 def test_an_empty_bin_is_an_answer(shared_server: Any, npy: Any) -> None:
     for shape in ((0, 3), (5, 3), (4, 4, 3)):
         reply = shared_server.post("/poses", npy(np.zeros(shape, np.float32)))  # zeros: missing points
@@ -183,6 +175,12 @@ def test_metrics_count_what_happened(start_server: Any, bundle_folder: Any, make
     assert labels["part"] == "bracket"
     assert labels["version"] == server.version() == labels["digest"][:12]
     assert not [line for line in text.splitlines() if not re.match(r"#|attentionvote_", line)]
+    # This server has no cell file.
+    stream = io.BytesIO()
+    Image.fromarray(np.full((20, 20), 800, np.uint16)).save(stream, "PNG")
+    reply = server.post("/poses", stream.getvalue())
+    assert reply.status == 400
+    assert reply.error == "a depth image needs its camera, got none: start the server with --cell and a camera in it"
 
 
 def test_hundreds_of_fuzzed_requests_leave_the_server_answering(

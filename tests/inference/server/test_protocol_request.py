@@ -27,6 +27,7 @@ def request(points: np.ndarray = CLOUD, *, binary: bool = True, **changes: Any) 
     return head + raw, str(len(head)) if binary else None
 
 
+@settings(max_examples=40)
 @given(arrays(np.float32, st.tuples(st.integers(0, 50), st.just(3)), elements=st.floats(-1e6, 1e6, width=32)))
 def test_binary_and_json_carry_the_same_points_exactly(points: np.ndarray) -> None:
     for binary in (True, False):

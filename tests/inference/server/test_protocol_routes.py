@@ -147,14 +147,12 @@ def test_malformed_requests_are_told_why(
     assert sentence.replace(".P, 3.", "[P, 3]") in reply.error
 
 
-def test_the_deadline_parameter_counts(
-    start_server: Any, make_bundle: Any, make_cloud: Any, infer_body: Callable[..., ENCODE]
-) -> None:
-    server = start_server(make_bundle(graph={"loops": 100_000}))
+def test_the_deadline_parameter_counts(slow_server: Any, make_cloud: Any, infer_body: Callable[..., ENCODE]) -> None:
+    server = slow_server
     body, headers = infer_body(make_cloud(), deadline_ms=20)
     late = server.post("/v2/models/bracket/infer", body, headers)
     assert late.status == 504
-    assert "deadline of 0.0" in late.error
+    assert "deadline of " in late.error
     assert late.json["reason"] == "deadline_exceeded"
     body, headers = infer_body(make_cloud(), deadline_ms=20_000)
     tight = {**headers, "X-Deadline-Ms": "30000"}
