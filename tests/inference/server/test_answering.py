@@ -83,10 +83,11 @@ def test_a_deadline_that_is_none_is_refused(shared_server: Any, make_cloud: Any,
 def test_a_body_that_never_ends_is_given_up_at_the_deadline(shared_server: Any) -> None:
     host, port = shared_server.address.split(":")
     with socket.create_connection((host, int(port)), timeout=10) as connection:
-        connection.sendall(
-            b"POST /poses HTTP/1.1\r\nHost: x\r\nX-Deadline-Ms: 150\r\nContent-Length: 5000\r\n\r\nhello"
-        )
-        reply = connection.recv(65536)
+        head = b"POST /poses HTTP/1.1\r\nHost: x\r\nConnection: close\r\nX-Deadline-Ms: 150\r\nContent-Length: 5000\r\n\r\n"
+        connection.sendall(head + b"hello")
+        reply = b""
+        while piece := connection.recv(65536):
+            reply += piece
     assert reply.startswith(b"HTTP/1.1 504 ")
     assert b"the deadline of 150 ms passed while the body was received" in reply
     shared_server.wait_until(lambda: shared_server.metric("queue_depth") == 0, "the place is free")
