@@ -83,8 +83,8 @@ def test_a_deadline_that_is_none_is_refused(shared_server: Any, make_cloud: Any,
 def test_a_body_that_never_ends_is_given_up_at_the_deadline(shared_server: Any) -> None:
     host, port = shared_server.address.split(":")
     with socket.create_connection((host, int(port)), timeout=10) as connection:
-        head = b"POST /poses HTTP/1.1\r\nHost: x\r\nConnection: close\r\nX-Deadline-Ms: 150\r\nContent-Length: 5000\r\n\r\n"
-        connection.sendall(head + b"hello")
+        head = b"POST /poses HTTP/1.1\r\nHost: x\r\nConnection: close\r\nX-Deadline-Ms: 150\r\n"
+        connection.sendall(head + b"Content-Length: 5000\r\n\r\nhello")
         reply = b""
         while piece := connection.recv(65536):
             reply += piece
