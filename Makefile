@@ -16,12 +16,13 @@ ARGS ?=
 PYTEST_ARGS ?=
 object := $(if $(OBJECT),object=$(OBJECT))
 
+smoke_object = $(or $(OBJECT),connecting_rod)
 # A bundle's folder is named after its part, so these targets cannot do without one.
 bundle = $(if $(OBJECT),outputs/export/$(OBJECT)/latest,$(error OBJECT must be given, e.g. make $@ OBJECT=connecting_rod))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train smoke export serve keys bench-serve generate view part ui test test-fast lint format clean
+.PHONY: help setup system train smoke export serve keys bench-serve image generate view part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -52,8 +53,12 @@ system:
 train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [ARGS="experiment=paper ..."]; resumes by itself
 	@$(PY) pipelines/train.py $(object) $(ARGS)
 
-smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores
-	@$(PY) pipelines/train.py object=$(or $(OBJECT),connecting_rod) experiment=smoke $(ARGS)
+smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores: scenes, training, export, a cell's check
+	@$(PY) pipelines/train.py object=$(smoke_object) experiment=smoke $(ARGS)
+	@$(PY) pipelines/export.py object=$(smoke_object) trained=outputs/smoke/train root=outputs/smoke/data \
+		outputs=outputs/smoke/export signing_keys=outputs/smoke/keys scenes=3 limits.scenes=3 golden=1
+	@$(VENV)/bin/attentionvote verify-bundle outputs/smoke/export/$(smoke_object)/latest \
+		--key outputs/smoke/keys/signing.pub --self-test >&2
 
 export: $(STAMP) ## Prove the trained model equal to one ONNX file, sign the bundle: OBJECT=connecting_rod [RUN=...]
 	@$(PY) pipelines/export.py $(object) $(if $(RUN),run=$(RUN)) $(ARGS)
@@ -66,6 +71,9 @@ keys: $(STAMP) ## Make the pair of keys that signs bundles (export does it when 
 
 bench-serve: $(STAMP) ## Load the server with 4 clients for a minute: OBJECT=connecting_rod [ARGS="--seconds 60"]
 	@$(PY) pipelines/bench_serve.py $(bundle) $(ARGS)
+
+image: ## Build the cell's container image with docker or buildah: [BASE=... ARGS=NAME]
+	@docker/build.sh $(ARGS)
 
 generate: $(STAMP) ## Drop parts into a bin by physics and keep the scenes: OBJECT=connecting_rod
 	@$(PY) pipelines/generate.py $(object) $(ARGS)
