@@ -38,6 +38,25 @@ def test_arrays_flat_and_organised() -> None:
     np.testing.assert_array_equal(read_cloud(npy(image)), np.delete(POINTS, 23, axis=0))
 
 
+def npz(**arrays: NDArray) -> bytes:
+    """A .npz file, packed as numpy packs it."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def test_an_archive_gives_its_points() -> None:
+    np.testing.assert_array_equal(read_cloud(npz(points=POINTS, confidence=np.zeros(3))), POINTS)
+    with pytest.raises(InputError, match=r"its archive must hold an array 'points', got cloud, pose"):
+        read_cloud(npz(cloud=POINTS, pose=np.eye(4)), "scan.npz")
+    whole = npz(points=POINTS)
+    for cut in (10, len(whole) // 2, len(whole) - 5):
+        with pytest.raises(InputError, match="scan must be a point cloud, but"):
+            read_cloud(whole[:cut], "scan")
+    with pytest.raises(InputError, match=r"must have at most 96000000 bytes"):
+        read_cloud(npz(points=np.zeros((4_000_001, 3))), "scan")
+
+
 def test_files_are_told_apart_by_content_and_named_by_path(tmp_path: Path) -> None:
     path = tmp_path / "scan.txt"
     path.write_bytes(PLY)
@@ -45,7 +64,7 @@ def test_files_are_told_apart_by_content_and_named_by_path(tmp_path: Path) -> No
         np.testing.assert_array_equal(read_cloud(source), [[1, 2, 3]])
     path.write_bytes(b"hello")
     with pytest.raises(
-        InputError, match=rf"^{path} must be a point cloud as PLY, PCD or NPY, got another kind of file"
+        InputError, match=rf"^{path} must be a point cloud as PLY, PCD, NPY or NPZ, got another kind of file"
     ):
         read_cloud(path)
     with pytest.raises(InputError, match=r"^upload must be a point cloud, got a PNG: a depth image needs its camera"):

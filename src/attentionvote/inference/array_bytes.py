@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NPY_MAGIC = b"\x93NUMPY"
+NPZ_MAGIC = b"PK\x03\x04"
 _MOST_HEADER_BYTES, _MOST_MEMBERS = 4096, 32
 # What numpy and the libraries in other languages write; numpy itself evaluates this text as Python.
 _HEADER = re.compile(

@@ -1,14 +1,15 @@
-"""Point clouds from files: PLY, PCD and NPY, told apart by their first bytes. No size in a header is believed."""
+"""Point clouds from files: PLY, PCD, NPY and NPZ, told apart by their first bytes. No size in a header is believed."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.inference import pcd_file, ply_file
-from attentionvote.inference.array_bytes import NPY_MAGIC, array_from_npy
+from attentionvote.inference.array_bytes import NPY_MAGIC, NPZ_MAGIC, array_from_npy, arrays_from_npz
 from attentionvote.inference.depth_files import PNG_MAGIC
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.file_bytes import file_bytes
@@ -28,7 +29,9 @@ def read_cloud(source: Path | str | bytes, name: str = "") -> NDArray[np.float32
     content, name = file_bytes(source, name)
     try:
         if content.startswith(NPY_MAGIC):
-            return _npy(content)
+            return _points(array_from_npy(content, MOST_POINTS * 24))
+        if content.startswith(NPZ_MAGIC):  # a golden cloud of a bundle, say
+            return _points(_array_points(arrays_from_npz(content, MOST_POINTS * 24)))
         if content.startswith(ply_file.MAGIC):
             return ply_file.points_from_ply(content, MOST_POINTS)
         if content.startswith(pcd_file.MAGIC):
@@ -37,12 +40,18 @@ def read_cloud(source: Path | str | bytes, name: str = "") -> NDArray[np.float32
         raise InputError(f"{name} must be a point cloud, but {error}") from error
     if content.startswith(PNG_MAGIC):
         raise InputError(f"{name} must be a point cloud, got a PNG: a depth image needs its camera (`--cell`)")
-    raise InputError(f"{name} must be a point cloud as PLY, PCD or NPY, got another kind of file")
+    raise InputError(f"{name} must be a point cloud as PLY, PCD, NPY or NPZ, got another kind of file")
 
 
-def _npy(content: bytes) -> NDArray[np.float32]:
+def _array_points(arrays: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    """The array ``points`` of an archive."""
+    if "points" not in arrays:
+        raise ValueError(f"its archive must hold an array 'points', got {', '.join(arrays)[:80] or 'none'}")
+    return arrays["points"]
+
+
+def _points(array: NDArray[Any]) -> NDArray[np.float32]:
     """Points of an array ``(P, 3)`` or ``(H, W, 3)``."""
-    array = array_from_npy(content, MOST_POINTS * 24)
     if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise ValueError(f"its array must have shape (P, 3) or (H, W, 3), got {array.shape}")
     if array.dtype.kind != "f":

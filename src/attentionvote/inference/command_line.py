@@ -71,7 +71,7 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
     verb = verbs.add_parser("estimate", help="poses in one cloud or depth image", description=_estimate.__doc__)
     verb.add_argument(
-        "file", metavar="FILE", help="PLY, PCD or NPY in metres; with a camera in --cell also a depth PNG"
+        "file", metavar="FILE", help="PLY, PCD, NPY or NPZ in metres; with a camera in --cell also a depth PNG"
     )
     _add_bundle_options(verb)
     verb.add_argument("--cell", metavar="FILE", help="JSON with the cell's camera and bin")
