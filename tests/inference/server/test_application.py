@@ -135,6 +135,17 @@ def test_wrong_paths_and_methods(shared_server: Any, method: str, path: str, sta
     assert sentence in reply.error
 
 
+def test_headers_without_end_are_refused(shared_server: Any) -> None:
+    host, port = shared_server.address.split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection:
+        with suppress(OSError):  # it hangs up before everything is sent
+            for i in range(200):
+                connection.sendall(f"{'GET /v2 HTTP/1.1' if i == 0 else f'X-{i}: ' + 'y' * 1000}\r\n".encode())
+        with suppress(OSError):
+            assert connection.recv(65536).startswith(b"HTTP/1.1 400 ")
+    assert shared_server.get("/v2/health/live").status == 200
+
+
 def test_the_front_page_says_what_is_served(shared_server: Any) -> None:
     content = shared_server.get("/").json
     assert content["model"]["version"] == shared_server.version()
