@@ -43,7 +43,7 @@ def test_the_deadline_stops_the_work_and_frees_the_place(slow_server: Any, make_
     before = server.metric("requests_total", outcome="deadline")
     body = npy(make_cloud())
     server.post("/poses", body)
-    whole = max(line["stages_ms"]["estimate"] for line in server.log("request") if "stages_ms" in line)
+    whole = max(line.get("stages_ms", {}).get("estimate", 0.0) for line in server.log("request"))
     begun = time.monotonic()
     reply = server.post("/poses", body, {"X-Deadline-Ms": "100"})
     assert time.monotonic() - begun < 0.6 * whole / 1e3
@@ -53,7 +53,7 @@ def test_the_deadline_stops_the_work_and_frees_the_place(slow_server: Any, make_
     assert reply.json["poses"] == []
     assert "the deadline of " in reply.error
     # Cancelled for real: nothing goes on in the background, the place is free at once.
-    server.wait_until(lambda: server.metric("queue_depth") == 0, "the place is free", 0.25)
+    server.wait_until(lambda: server.metric("queue_depth") == 0, "the place is free", 1.0)
     assert server.metric("requests_total", outcome="deadline") == before + 1
     assert server.metric("abstentions_total", reason="deadline_exceeded") == before + 1
 
