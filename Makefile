@@ -61,7 +61,7 @@ smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 core
 		--key outputs/smoke/keys/signing.pub --self-test >&2
 
 export: $(STAMP) ## Prove the trained model equal to one ONNX file, sign the bundle: OBJECT=connecting_rod [RUN=...]
-	@$(PY) pipelines/export.py $(object) $(if $(RUN),run=$(RUN)) $(ARGS)
+	@$(PY) pipelines/export.py $(object) $(if $(RUN),"run='$(RUN)'") $(ARGS)
 
 serve: $(STAMP) ## Serve the newest bundle on this machine, as a cell does: OBJECT=connecting_rod [ARGS="--port 8080"]
 	@$(VENV)/bin/attentionvote serve $(bundle) $(ARGS)

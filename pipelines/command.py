@@ -158,7 +158,7 @@ def _one_sentence(verb: str) -> Iterator[None]:
         cause = _root(error)
         if isinstance(cause, (ValueError, TypeError, OSError, InstantiationException)):
             _leave(f"{verb}: {sentence(cause)}", 2)
-        _leave(f"{verb}: {sentence(cause)} ({type(cause).__name__}, details in {_write_traceback(verb)})", 1)
+        _leave(f"{verb}: {type(cause).__name__}: {sentence(cause)}{_details(verb)}", 1)
     except KeyboardInterrupt:
         _leave(f"{verb}: interrupted; run the same command to resume", 130)
     except SystemExit as error:
@@ -169,7 +169,7 @@ def _one_sentence(verb: str) -> Iterator[None]:
     except BaseException as error:
         expected = isinstance(error, (ValueError, OSError))
         kind = "" if expected else f"{type(error).__name__}: "
-        _leave(f"{verb}: {kind}{sentence(error)} (details in {_write_traceback(verb)})", 1)
+        _leave(f"{verb}: {kind}{sentence(error)}{_details(verb)}", 1)
 
 
 def _leave(message: str, code: int) -> NoReturn:
@@ -178,11 +178,15 @@ def _leave(message: str, code: int) -> NoReturn:
     raise SystemExit(code) from None
 
 
-def _write_traceback(verb: str) -> Path:
-    LOGS.mkdir(parents=True, exist_ok=True)
+def _details(verb: str) -> str:
+    """Where the traceback is, for the end of a sentence; nothing when it cannot be written (a full disk, say)."""
     path = LOGS / f"{verb}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.log"
-    path.write_text(f"{' '.join(sys.argv)}\n\n{traceback.format_exc()}", encoding="utf-8")
-    return path
+    try:
+        LOGS.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{' '.join(sys.argv)}\n\n{traceback.format_exc()}", encoding="utf-8")
+    except OSError:
+        return ""
+    return f" (details in {path})"
 
 
 class _Plain(logging.Formatter):

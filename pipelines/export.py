@@ -19,9 +19,15 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     """Export, prove, sign; where the bundle is and what the proof measured."""
     from export_job import ExportJob
 
-    with configuring(f"object {cfg.object.name}"):
+    with configuring():
         job = ExportJob.find(cfg)
-    return job.run()
+    with job.locked():
+        result = job.done()
+        if result is None:
+            with configuring():
+                work = job.prepare()
+            result = work.run()
+    return result
 
 
 if __name__ == "__main__":

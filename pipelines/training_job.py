@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from configuration import ConfigurationError
+from folder_lock import locked_folder
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -38,13 +36,13 @@ class TrainingJob:
     @property
     def run_id(self) -> str | None:
         """Of the MLflow run, once there is one."""
-        run_id = (_read_json(self.directory / RUN) or {}).get("run_id")
+        run_id = (read_json(self.directory / RUN) or {}).get("run_id")
         return run_id if isinstance(run_id, str) else None
 
     @property
     def result(self) -> dict[str, Any] | None:
         """What the training ended with; None while it is not complete or when its model is gone."""
-        result = _read_json(self.directory / RESULT)
+        result = read_json(self.directory / RESULT)
         if result is not None and not (self.directory / MODEL).is_file():
             log.warning("%s is gone: the training is completed again", self.directory / MODEL)
             return None
@@ -56,27 +54,9 @@ class TrainingJob:
             if path.name != ".lock":
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Be the only process of this training.
-
-        Raises:
-            ConfigurationError: when another one is at it, or the folder cannot be written.
-        """
-        try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            lock = (self.directory / ".lock").open("w")
-        except OSError as error:
-            reason = error.strerror or error
-            raise ConfigurationError(f"outputs={self.directory.parents[1]} cannot be written: {reason}") from error
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, also on kill -9
-            except BlockingIOError as error:
-                raise ConfigurationError(
-                    f"another process is at this training ({self.directory}): wait for it, or end it"
-                ) from error
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Be the only process of this training; ConfigurationError when another one is at it."""
+        return locked_folder(self.directory, str(self.directory.parents[1]), "training")
 
 
 def find_training(cfg: DictConfig) -> TrainingJob:
@@ -145,12 +125,15 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The object in a JSON file; None when there is no such file, or, with a warning, when it is damaged."""
     try:
-        content = json.loads(path.read_text())
-        return content if isinstance(content, dict) else None
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except ValueError:
+        content = None
+    if not isinstance(content, dict):
         log.warning("%s is damaged and is passed over", path)
         return None
+    return content

@@ -44,7 +44,24 @@ def make(folder: Path, *words: str, first_on_path: Path | None = None) -> subpro
 def test_help_is_the_default_and_names_every_target(checkout: Path) -> None:
     done = make(checkout)
     assert done.returncode == 0
-    for target in ("setup", "train", "smoke", "generate", "view", "part", "ui", "test", "test-fast", "lint", "clean"):
+    for target in (
+        "setup",
+        "train",
+        "smoke",
+        "export",
+        "serve",
+        "keys",
+        "bench-serve",
+        "image",
+        "generate",
+        "view",
+        "part",
+        "ui",
+        "test",
+        "test-fast",
+        "lint",
+        "clean",
+    ):
         assert f"\n  {target} " in done.stdout, target
 
 
@@ -94,5 +111,11 @@ def test_setup_happens_once_and_again_when_the_pins_change(checkout: Path) -> No
 def test_words_reach_the_verb(checkout: Path) -> None:
     done = make(checkout, "--dry-run", "train", "OBJECT=gear", "ARGS=trainer.max_epochs=2 seed=1")
     assert done.stdout.rstrip().endswith("pipelines/train.py object=gear trainer.max_epochs=2 seed=1")
+    done = make(checkout, "--dry-run", "export", "OBJECT=gear", "RUN=70e1")
+    assert done.stdout.rstrip().endswith("""pipelines/export.py object=gear "run='70e1'\"""")
+    done = make(checkout, "--dry-run", "serve", "OBJECT=gear", "ARGS=--port 80")
+    assert done.stdout.rstrip().endswith("attentionvote serve outputs/export/gear/latest --port 80")
+    done = make(checkout, "serve")
+    assert "OBJECT must be given, e.g. make serve OBJECT=connecting_rod" in done.stderr
     done = make(checkout, "--dry-run", "part", "NAME=bracket", "MESH=my meshes/b.stl", "UNITS=mm")
     assert done.stdout.rstrip().endswith("""pipelines/part.py name=bracket "mesh='my meshes/b.stl'" units=mm""")

@@ -1,8 +1,8 @@
 """The one agreement between training and cell: the exported graph's tensors and the card that travels with it.
 
 The training side writes both, the cell reads both, and neither imports the other. The card is complete: an estimator
-needs nothing else to know units, frame, thresholds and preprocessing. Its figures of parity and evaluation are
-measured *on* the graph, so the graph itself carries the card without them (:meth:`ModelCard.core`).
+needs nothing else to know units, frame, thresholds and preprocessing. Its figures of parity are measured on the
+finished graph, so the graph itself carries the card without figures (:meth:`ModelCard.core`).
 """
 
 from __future__ import annotations

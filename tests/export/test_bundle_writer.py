@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,10 +26,9 @@ KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 
 @pytest.fixture
 def write(graph: bytes, card: ModelCard, part: Part, make_cloud: Callable[..., Cloud], tmp_path: Path) -> Callable:
-    clouds = {f"scene_{seed}": make_cloud(seed, 1500)[0] for seed in (1, 2)}
-
-    def run(**changes: object) -> object:
-        return write_bundle(graph, replace(card, **changes), part, clouds, KEY, tmp_path / "brick")
+    def run(golden: int = 2, **changes: object) -> object:
+        clouds = ((f"scene_{seed}", make_cloud(seed, 1500)[0]) for seed in (1, 2, 3))
+        return write_bundle(graph, replace(card, **changes), part, clouds, golden, KEY, tmp_path / "brick")
 
     return run
 
@@ -78,22 +79,88 @@ def test_a_bundle_that_fails_its_test_is_not_published(
     assert sorted(p.name for p in folder.iterdir()) == sorted([before.digest[:12], "latest"])
 
 
-def test_a_cloud_without_poses_is_no_golden_cloud(write: Callable, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="golden cloud scene_1 must show poses, but the model finds none"):
+def test_only_clouds_with_a_clear_pose_are_golden(
+    write: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ValueError, match=r"a golden cloud must show a pose with confidence of at least 1, but .*"):
         write(confidence_threshold=0.9999)
     assert list((tmp_path / "brick").iterdir()) == []
+    best = {cloud.name: float(cloud.confidence.max()) for cloud in write(golden=3).golden()}
+    assert len(best) == 3
+    weakest, strongest = min(best, key=best.__getitem__), max(best, key=best.__getitem__)
+    between = (best[weakest] + best[strongest]) / 2
+    monkeypatch.setattr(bundle_writer, "clear_confidence", lambda _: between)
+    names = [cloud.name for cloud in write(golden=3).golden()]
+    assert strongest in names
+    assert weakest not in names
 
 
-def test_what_a_killed_export_left_is_swept_away_and_a_running_ones_is_not(write: Callable, tmp_path: Path) -> None:
-    dead, alive = (
-        tmp_path / "brick" / ".writing-bundle.999999999",
-        tmp_path / "brick" / f".writing-bundle.{os.getppid()}",
-    )
-    for folder in (dead, alive):
-        folder.mkdir(parents=True)
-    write()
-    assert not dead.exists()
-    assert alive.exists()
+def test_a_damaged_copy_is_replaced_and_a_whole_one_left_alone(write: Callable, tmp_path: Path) -> None:
+    bundle = write()
+    inode = (bundle.path / "model.onnx").stat().st_ino
+    assert (write().path / "model.onnx").stat().st_ino == inode
+    with (bundle.path / "model.onnx").open("r+b") as file:
+        file.seek(1000)
+        file.write(b"x")
+    (tmp_path / "brick" / "latest").unlink()
+    again = write()
+    assert again.digest == bundle.digest
+    assert load_bundle(tmp_path / "brick" / "latest", KEY.public_key()).digest == bundle.digest
+    assert sorted(p.name for p in (tmp_path / "brick").iterdir()) == sorted([bundle.digest[:12], "latest"])
+
+
+KILLED = """
+import os, pathlib, shutil, signal, sys
+sys.path.insert(0, sys.argv[1])
+from bundle_of_test import write
+left = int(sys.argv[2])
+def counting(function):
+    def counted(*a, **k):
+        global left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*a, **k)
+    return counted
+for owner, name in ((pathlib.Path, "rename"), (pathlib.Path, "replace"), (os, "fsync"), (shutil, "rmtree")):
+    setattr(owner, name, counting(getattr(owner, name)))
+write()
+"""
+WRITE = """
+import pathlib
+import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from attentionvote.contract import ModelCard
+from attentionvote.export import write_bundle
+from attentionvote.simulation import load_part
+here = pathlib.Path(__file__).parent
+def write():
+    card = ModelCard.from_json((here / "card.json").read_text())
+    key = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
+    part = load_part("brick", "builtin:brick")
+    clouds = [("scene_1", np.load(here / "cloud.npy"))]
+    return write_bundle((here / "model.onnx").read_bytes(), card, part, clouds, 1, key, here / "brick")
+"""
+
+
+@pytest.mark.parametrize("step", [1, 8, 14, 17])
+def test_killed_anywhere_what_served_stays_and_the_next_export_ends_well(
+    graph: bytes, card: ModelCard, write: Callable, make_cloud: Callable[..., Cloud], tmp_path: Path, step: int
+) -> None:
+    before = write()
+    changed = replace(card, evaluation={"ap_10": 0.75})
+    (tmp_path / "model.onnx").write_bytes(graph)
+    (tmp_path / "card.json").write_text(changed.to_json(), encoding="utf-8")
+    np.save(tmp_path / "cloud.npy", make_cloud(1, 1500)[0])
+    (tmp_path / "bundle_of_test.py").write_text(WRITE, encoding="utf-8")
+    command = [sys.executable, "-c", KILLED, str(tmp_path), str(step)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    folder = tmp_path / "brick"
+    assert load_bundle(folder / "latest", KEY.public_key()).card in (before.card, changed)
+    after = write(golden=1, evaluation={"ap_10": 0.75})
+    assert load_bundle(folder / "latest", KEY.public_key()).digest == after.digest
+    assert sorted(p.name for p in folder.iterdir()) == sorted([before.digest[:12], after.digest[:12], "latest"])
 
 
 def test_a_triton_repository_names_every_tensor(write: Callable, tmp_path: Path, card: ModelCard) -> None:

@@ -46,12 +46,14 @@ def cloud(kind: str) -> NDArray[np.float32]:
         points = points[rng.integers(0, 40, COUNT)]
     elif kind == "sparse":  # balls that hold their centre only
         points = points * [10, 10, 1]
+    elif kind == "stray":  # a few points on a wall ten metres behind
+        points[::97] += [3.0, -2.0, 10.0]
     elif kind == "one place":
         points = np.full((COUNT, 3), 0.5)
     return points.astype(np.float32)
 
 
-@pytest.mark.parametrize("kind", ["uniform", "lattice", "repeated", "sparse", "one place"])
+@pytest.mark.parametrize("kind", ["uniform", "lattice", "repeated", "sparse", "stray", "one place"])
 def test_the_graph_finds_what_the_operators_find(finder: onnxruntime.InferenceSession, kind: str) -> None:
     points = cloud(kind)
     order, *rest = (a[0] for a in finder.run(None, {"points": points[None]}))

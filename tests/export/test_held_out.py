@@ -61,7 +61,7 @@ def test_the_scenes_are_found_by_their_content(root: Path, part: Part, metadata:
 
 def test_other_scenes_and_other_parts_are_not_taken(root: Path, part: Part, metadata: dict[str, Any]) -> None:
     gone = metadata | {"data": {"test": "f" * 64}}
-    with pytest.raises(ValueError, match=r"the test scenes ffffffffffff of the training must lie below .*, or train"):
+    with pytest.raises(ValueError, match=r"the test scenes ffffffffffff of the training must lie below .*, or make"):
         held_out.find_test_scenes(gone, part, root)
     with pytest.raises(ValueError, match=r"brick must be the part the network was trained for .* has changed"):
         held_out.find_test_scenes(metadata, replace(part, diameter=0.05), root)

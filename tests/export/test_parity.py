@@ -83,8 +83,8 @@ def test_average_precision_is_that_of_all_confidences(part: Part) -> None:
     [
         ({"scenes": 1}, "scenes must be at least 2, got 1"),
         ({"pairs": 0}, "at least one detection must be compared, got none"),
-        ({"unmatched": 1}, "unmatched must be at most 0, got 1"),
-        ({"translation_mm": 0.11}, "translation_mm must be at most 0.1, got 0.11"),
+        ({"unmatched": 1, "unmatched_scenes": (4,)}, "unmatched must be at most 0, got 1 (scene 4)"),
+        ({"translation_mm": 0.11, "worst_scene": 3}, "translation_mm must be at most 0.1, got 0.11 (scene 3)"),
         ({"translation_p99_mm": 0.011}, "translation_p99_mm must be at most 0.01, got 0.011"),
         ({"rotation_degrees": 0.2}, "rotation_degrees must be at most 0.1, got 0.2"),
         ({"rotation_p99_degrees": 0.02}, "rotation_p99_degrees must be at most 0.01, got 0.02"),
@@ -142,8 +142,27 @@ def test_the_network_itself_passes_and_another_does_not(
     assert other.unmatched > 0
     broken = make_network(0)
     with torch.no_grad():
-        broken.output.bias[:3] += 0.02  # moves every centre by 0.2 mm a 0.1 D
-    for refiner in broken.refiners:
-        refiner.output.bias.data[:3] += 0.02
+        broken.refiners[-1].output.bias[:3] += 0.1  # moves every final centre by 0.01 D along each axis
     moved = measure_parity(network, run_of(broken), samples, part, 0.05, 0.1)
-    assert any("translation_mm must be at most" in v or "unmatched" in v for v in moved.violations(LIMITS))
+    assert moved.translation_mm == pytest.approx(1000 * 0.01 * part.diameter * 3**0.5, rel=0.1)
+    assert any(v.startswith("translation_mm must be at most 0.1") for v in moved.violations(LIMITS))
+
+
+def test_the_worst_scene_and_those_with_unmatched_poses_are_named(part: Part) -> None:
+    fine, moved = scene(poses(0.0), [0.9]), poses(0.0)
+    moved[0, 0, 3] += 0.0003
+    answers = [fine, scene(moved, [0.9]), scene(poses(), []), fine]
+    parity = compare([fine] * 4, answers, part, 0.5)
+    assert (parity.worst_scene, parity.unmatched_scenes) == (1, (2,))
+
+
+def test_an_answer_that_is_no_number_is_refused(
+    network: AttentionVote, make_cloud: Callable[..., Cloud], part: Part
+) -> None:
+    def damaged(points: NDArray[np.float32], normals: NDArray[np.float32]) -> dict:
+        outputs = run_of(network)(points, normals)
+        outputs["confidence"] = np.full_like(outputs["confidence"], np.nan)
+        return outputs
+
+    with pytest.raises(ValueError, match="the graph's confidence must be finite, got NaN or inf in scene 0"):
+        measure_parity(network, damaged, [batch(network, make_cloud(0))], part, 0.05, 0.1)

@@ -19,7 +19,7 @@ from attentionvote.geometry.pose import matrix_from_quaternion as matrix
 from attentionvote.geometry.pose import quaternion_from_matrix, random_quaternion, rotation_about, transform
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.inference import Bundle, Crop, PoseEstimator, load_bundle, self_test
-from attentionvote.inference.golden import pose_errors
+from attentionvote.inference.golden import clear_confidence, pose_errors
 
 MakeBundle = Callable[..., Path]
 Try = Callable[..., list[str]]
@@ -203,3 +203,10 @@ def test_a_cloud_that_cannot_be_estimated_and_one_that_is_none(
         assert self_test(estimator, broken) == [
             "golden/a.npz must be a golden cloud, but it is no .npz archive, or damaged: export the bundle again"
         ]
+
+
+@pytest.mark.parametrize(
+    ("threshold", "clear"), [(0.0, 0.1), (0.5, 0.6), (0.6, 0.7), (0.9, 0.925), (0.98, 0.985), (1.0, 1.1), (40.0, 44.0)]
+)
+def test_a_clear_confidence_can_be_reached_and_lies_above_the_threshold(threshold: float, clear: float) -> None:
+    assert clear_confidence(threshold) == pytest.approx(clear)

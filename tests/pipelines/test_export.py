@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -93,7 +94,7 @@ def test_a_training_becomes_a_bundle_that_a_cell_trusts(trained: Path, exported:
     assert bundle.digest == exported["digest"]
     card = bundle.card
     assert (card.run_id, card.commit, card.evaluation) == ("feed" * 8, "c" * 40, {"ap_10": 0.1})
-    assert card.parity["CPU"] == exported["parity"]["CPU"]
+    assert card.parity == {"limits": exported["limits"], "paths": exported["parity"]}
     assert exported["parity"]["CPU"]["scenes"] == 4
     assert exported["parity"]["CPU"]["pairs"] > 4
     assert len(bundle.golden()) == 2
@@ -101,12 +102,67 @@ def test_a_training_becomes_a_bundle_that_a_cell_trusts(trained: Path, exported:
     assert exported["milliseconds"]["CPU"] > 0
 
 
+@pytest.fixture
+def again(trained: Path, exported: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+    """The verb in this process, where the training was; tracing again is an error."""
+    import attentionvote.export
+
+    def never(*_: object) -> bytes:
+        raise AssertionError("traced again")
+
+    monkeypatch.chdir(trained)
+    monkeypatch.setattr(attentionvote.export, "export_graph", never)
+    words = [*EXPORT, f"signing_keys={trained}/keys"]
+    assert exported["stage"] == "export"
+    return lambda *more: export.run(compose("export", [*words, *more]))
+
+
 @pytest.mark.slow
-def test_what_is_done_is_not_done_again(trained: Path, exported: dict[str, Any]) -> None:
-    done = python("export.py", *EXPORT, "triton=triton", folder=trained)
-    assert done.returncode == 0, done.stderr
-    assert "this export is done (force=true repeats it)" in done.stderr
-    assert json.loads(done.stdout) == exported
+def test_what_is_done_is_not_done_again(again: Callable, exported: dict[str, Any]) -> None:
+    assert again("triton=triton") == exported
+
+
+@pytest.mark.slow
+def test_a_done_export_points_latest_at_its_bundle_and_writes_triton(again: Callable, trained: Path) -> None:
+    latest = trained / "outputs" / "export" / "brick" / "latest"
+    place = latest.resolve()
+    latest.unlink()
+    shutil.rmtree(trained / "triton")
+    again("triton=triton")
+    assert latest.resolve() == place
+    assert (trained / "triton" / "brick" / "config.pbtxt").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["model", "record", "settings", "force"])
+def test_what_is_not_done_any_more_is_done_again(again: Callable, trained: Path, damage: str) -> None:
+    folder = trained / "outputs" / "export" / "brick"
+    record = next(folder.glob("export-*.json"))
+    model, text = folder / "latest" / "model.onnx", record.read_bytes()
+    content, words = model.read_bytes(), []
+    if damage == "model":
+        model.write_bytes(content[:-1] + b"x")
+    elif damage == "record":
+        record.write_bytes(b"[1")
+    else:
+        words = {"settings": ["golden=1"], "force": ["force=true"]}[damage]
+    try:
+        with pytest.raises(AssertionError, match="traced again"):
+            again(*words)
+    finally:
+        model.write_bytes(content)
+        record.write_bytes(text)
+    again()
+
+
+@pytest.mark.slow
+def test_changed_parts_and_lost_scenes_are_refused_before_any_work(again: Callable, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="brick must be the part the network was trained for"):
+        again("object.diameter=0.05")
+    with pytest.raises(ConfigurationError, match=r"the test scenes .* of the training must lie below"):
+        again("force=true", f"root={tmp_path}")
+    with pytest.raises(ConfigurationError, match=r"at least limits.scenes \(5\) held-out scenes .* got 4"):
+        again("scenes=5", "limits.scenes=5")
 
 
 @pytest.mark.slow
@@ -131,9 +187,9 @@ def test_over_the_limits_only_the_report_is_written(
     with pytest.raises(ValueError, match=r"must be equal within the limits, but CPU: .*the report is"):
         export.run(cfg)
     written = [p.relative_to(tmp_path / "export").as_posix() for p in (tmp_path / "export").rglob("*") if p.is_file()]
-    assert written == ["brick/parity-abcdefabcdef.json"]
-    report = json.loads((tmp_path / "export" / written[0]).read_text(encoding="utf-8"))
-    assert report["paths"]["CPU"]["scenes"] == 4
+    assert sorted(written) == ["brick/.lock", "brick/parity-abcdefabcdef.json"]
+    report = json.loads((tmp_path / "export" / "brick" / "parity-abcdefabcdef.json").read_text(encoding="utf-8"))
+    assert report["parity"]["CPU"]["scenes"] == 4
 
 
 @pytest.fixture
@@ -159,6 +215,39 @@ def test_a_training_that_cannot_be_meant_is_one_sentence(two_trainings: list[str
     with pytest.raises(ConfigurationError) as caught:
         export.run(compose("export", [*two_trainings, word]))
     assert message in str(caught.value)
+
+
+def test_a_damaged_training_is_passed_over(two_trainings: list[str], tmp_path: Path) -> None:
+    from export_job import ExportJob
+
+    (tmp_path / "train" / "brick" / "aaaa11112222" / "result.json").write_text("", encoding="utf-8")
+    assert ExportJob.find(compose("export", two_trainings)).training.name == "aaaa33334444"
+
+
+def test_one_process_exports_a_part(two_trainings: list[str]) -> None:
+    from export_job import ExportJob
+
+    job = ExportJob.find(compose("export", two_trainings))
+    refused = pytest.raises(ConfigurationError, match="another process is at this part's export")
+    with job.locked(), refused, job.locked():
+        raise AssertionError("two at once")
+
+
+def test_a_place_that_cannot_be_written_is_said_first(two_trainings: list[str], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigurationError, match=r"outputs=.*/file/x cannot be written: Not a directory"):
+        export.run(compose("export", [*two_trainings, f"outputs={tmp_path}/file/x"]))
+
+
+def test_a_lost_public_key_comes_back(two_trainings: list[str], tmp_path: Path) -> None:
+    from export_job import ExportJob
+
+    ExportJob.find(compose("export", two_trainings))
+    public = tmp_path / "keys" / "signing.pub"
+    text = public.read_bytes()
+    public.unlink()
+    ExportJob.find(compose("export", two_trainings))
+    assert public.read_bytes() == text
 
 
 def test_a_run_is_named_by_the_beginning_of_its_id_or_folder(two_trainings: list[str]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,100 +12,127 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
-from attentionvote.inference import Abstention, PoseEstimator
+from attentionvote.inference import BundleError, Estimate, PoseEstimator
 from attentionvote.inference.bundle import Bundle, load_bundle
-from attentionvote.inference.golden import self_test
+from attentionvote.inference.golden import clear_confidence, self_test
 from attentionvote.inference.manifest import CARD, GOLDEN, MESH, MODEL, write_manifest
 from attentionvote.part import Part
 from attentionvote.simulation.mesh import write_surface
 
 LATEST = "latest"
+_DRAFT, _OLD, _LINK = ".writing-bundle", ".old-bundle", ".writing-link"
 
 
 def write_bundle(
     model: bytes,
     card: ModelCard,
     part: Part,
-    clouds: Mapping[str, NDArray[np.float32]],
+    clouds: Iterable[tuple[str, NDArray[np.float32]]],
+    golden: int,
     key: Ed25519PrivateKey,
     folder: Path,
 ) -> Bundle:
     """Write ``folder/DIGEST`` and point ``folder/latest`` at it.
 
-    The golden poses are what the shipped estimator answers for ``clouds`` here and now; a cell that answers
-    otherwise must not serve. The bundle is loaded and tested as a cell would before it gets its name.
+    The golden poses are what the shipped estimator answers here and now; a cell that answers otherwise must not serve.
+    The bundle is loaded and tested as a cell would before it gets its name. One process at a time may write in the
+    folder.
 
     Args:
         model: the ONNX file.
         card: with all figures.
         part: its mesh, for viewers.
-        clouds: name to ``(P, 3)``: golden clouds of scenes that were held out.
+        clouds: names and clouds ``(P, 3)`` of scenes that were held out; the first that show clear poses become golden.
+        golden: how many of them.
         key: signs the manifest.
         folder: of the part's bundles.
 
     Raises:
-        ValueError: when a cloud shows nothing to the model, or the bundle does not pass its own self-test.
+        ValueError: when no cloud shows a clear pose, or the bundle does not pass its own self-test.
         OSError: when it cannot be written; ``latest`` stays where it was.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob(".writing-*"):
-        if not _alive(int(leftover.suffix[1:] or 0)):
-            shutil.rmtree(leftover, ignore_errors=True)
-    draft = folder / f".writing-bundle.{os.getpid()}"
+    draft, old = folder / _DRAFT, folder / _OLD
+    for leftover in (draft, old):  # of a killed process
+        shutil.rmtree(leftover, ignore_errors=True)
     try:
         (draft / GOLDEN).mkdir(parents=True)
         (draft / MODEL).write_bytes(model)
         (draft / CARD).write_text(card.to_json(), encoding="utf-8")
         write_surface(part.vertices, part.faces, draft / MESH)
-        _write_golden(model, card, clouds, draft)
+        _write_golden(model, card, clouds, golden, draft)
         write_manifest(draft, key)
         bundle = load_bundle(draft, key.public_key())
         with PoseEstimator(bundle) as estimator:
             problems = self_test(estimator, bundle)
         if problems:
             raise ValueError(f"the bundle must pass its own self-test, but {problems[0]}")
-        _settle(draft)
         place = folder / bundle.digest[:12]
-        if place.exists():
-            shutil.rmtree(place)  # the same content: at most a damaged copy is lost
-        draft.rename(place)
+        if not is_whole(place, key):
+            _settle(draft)
+            if place.exists():
+                place.rename(old)
+            draft.rename(place)
+            _sync(folder)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
-    _point(folder / LATEST, place.name)
+        for leftover in (draft, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+    point_latest(place)
     return load_bundle(place, key.public_key())
 
 
-def _write_golden(model: bytes, card: ModelCard, clouds: Mapping[str, NDArray[np.float32]], draft: Path) -> None:
+def is_whole(place: Path, key: Ed25519PrivateKey) -> bool:
+    """Whether a folder holds a bundle that this key signed, with nothing missing, damaged or added."""
+    try:
+        load_bundle(place, key.public_key())
+    except BundleError:
+        return False
+    return True
+
+
+def point_latest(place: Path) -> None:
+    """Point ``latest`` at a bundle in one step: a server that watches it sees the old bundle or the new one."""
+    temporary, link = place.with_name(_LINK), place.with_name(LATEST)
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(place.name)
+    temporary.replace(link)
+    _sync(place.parent)
+
+
+def _write_golden(
+    model: bytes, card: ModelCard, clouds: Iterable[tuple[str, NDArray[np.float32]]], count: int, draft: Path
+) -> None:
+    written, clear = 0, clear_confidence(card.confidence_threshold)
     with PoseEstimator(Bundle(draft, card, "", model)) as estimator:
-        for name, points in clouds.items():
+        for name, points in clouds:
             answer = estimator.estimate_parts_only(points)
-            if isinstance(answer, Abstention):
-                raise ValueError(f"golden cloud {name} must show poses, but the model finds none: {answer.message}")
+            if not isinstance(answer, Estimate) or answer.detections[0].confidence < clear:
+                continue  # it would test nothing
             np.savez(
                 draft / GOLDEN / f"{name}.npz",
                 points=points,
                 camera_from_part=np.stack([d.camera_from_part for d in answer.detections]),
                 confidence=np.array([d.confidence for d in answer.detections], dtype=np.float32),
             )
+            written += 1
+            if written == count:
+                return
+    if not written:
+        raise ValueError(
+            f"a golden cloud must show a pose with confidence of at least {clear:.3g}, but the model finds none in any "
+            "held-out scene: train it longer"
+        )
 
 
 def _settle(folder: Path) -> None:
     """Everything on the disk before the folder gets its name: a power cut leaves no half bundle under it."""
-    for path in sorted(folder.rglob("*")):
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+    for path in [*sorted(folder.rglob("*")), folder]:
+        _sync(path)
 
 
-def _point(link: Path, target: str) -> None:
-    """Move a symbolic link in one step: a server that watches it sees the old bundle or the new one."""
-    temporary = link.with_name(f".{link.name}.{os.getpid()}")
-    temporary.unlink(missing_ok=True)
-    temporary.symlink_to(target)
-    temporary.replace(link)
-
-
-def _alive(process: int) -> bool:
-    return process > 0 and Path(f"/proc/{process}").exists()
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -20,6 +20,7 @@ from torch._higher_order_ops.scan import scan
 from attentionvote.model import Layout, Neighborhoods
 
 _ROW = 256  # points a row of the two-step ArgMax
+ERROR = 2e-6  # of the matrix product, relative to the squared distances it is made of; float32 has 6e-8 an operation
 SPARE = 8  # candidates beyond those wanted: more than ever lie on the edge of a ball
 CHUNK = 16  # centres a step: their distances stay in the cache
 
@@ -53,17 +54,17 @@ def ball_query(
     """The first ``count`` points in index order within ``radius`` of each centre, short balls padded with their first.
 
     Every centre is one of the points, so no ball is empty. One matrix product gives ``d^2 - r^2`` of a few centres and
-    all points, in half the time of differences and squares but with an error of a millionth of the cloud's size
-    squared. So it chooses ``SPARE`` candidates too many from a ball that much larger, and differences and squares
-    decide among these.
+    all points, in half the time of differences and squares but with an error of a millionth of their squared distances
+    from the cloud's middle. So it chooses ``SPARE`` candidates too many from a ball larger by that, pair by pair, and
+    differences and squares decide among these.
     """
     chunk = _divisor(len(centers))
     most, candidates = min(count, len(points)), min(count + SPARE, len(points))
     middle = points.mean(0)
     p, c = points - middle, centers - middle
-    squared = p.square().sum(-1)
-    columns = torch.stack([*p.unbind(-1), torch.ones(len(points)), squared - radius * radius - 2e-6 * squared.max()])
-    rows = torch.cat([-2 * c, c.square().sum(-1, keepdim=True), torch.ones(len(centers), 1)], dim=-1)
+    far = p.square().sum(-1) * (1 - ERROR)
+    columns = torch.stack([*p.unbind(-1), torch.ones(len(points)), far - radius * radius])
+    rows = torch.cat([-2 * c, c.square().sum(-1, keepdim=True) * (1 - ERROR), torch.ones(len(centers), 1)], dim=-1)
     limit = torch.tensor(radius, dtype=torch.float32).square()
 
     def step(carry: Tensor, block: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

@@ -47,7 +47,7 @@ def find_test_scenes(metadata: dict[str, Any], part: Part, root: Path) -> SceneS
                 return scenes
     raise ValueError(
         f"the test scenes {wanted[:12]} of the training must lie below {root / 'scenes' / part.name}, but they do not: "
-        "name their place with root=..., or train again"
+        "name their place with root=..., or make them again with `make generate` and the training's simulation settings"
     )
 
 

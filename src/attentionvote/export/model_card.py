@@ -10,8 +10,7 @@ from attentionvote.contract import ModelCard, PartCard
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
 
-# Of the packages that decide what the graph is.
-_PACKAGES = ("attentionvote", "torch", "onnx", "onnxscript")
+_PACKAGES = ("attentionvote", "torch", "onnx", "onnxscript", "onnxruntime", "numpy", "scipy")
 
 
 def model_card(
@@ -63,9 +62,14 @@ def model_card(
         data=dict(metadata["data"]),
         run_id=run_id,
         commit=commit,
-        versions={name: version(name) for name in _PACKAGES},
+        versions=package_versions(),
         evaluation={name: float(value) for name, value in metadata["test"].items()},
     )
+
+
+def package_versions() -> dict[str, str]:
+    """Of the packages that decide what the graph is and what it answers."""
+    return {name: version(name) for name in _PACKAGES}
 
 
 def _plain(value: Any) -> Any:

@@ -53,7 +53,9 @@ class Limits:
 class Parity:
     """Measured differences between checkpoint and graph; ``ap`` holds both sides' figures by name.
 
-    ``rotation`` is the least angle over the part's symmetries. ``pairs`` are matched detections.
+    ``rotation`` is the least angle over the part's symmetries. ``pairs`` are matched detections. ``worst_scene`` holds
+    the largest translation, ``unmatched_scenes`` those with a detection that only one side has: indices of the scenes
+    compared.
     """
 
     scenes: int
@@ -65,6 +67,8 @@ class Parity:
     rotation_p99_degrees: float
     confidence: float
     ap: Mapping[str, tuple[float, float]]
+    worst_scene: int = 0
+    unmatched_scenes: tuple[int, ...] = ()
 
     def violations(self, limits: Limits) -> list[str]:
         """One sentence for every limit that is broken; none when graph and checkpoint are equal."""
@@ -79,7 +83,9 @@ class Parity:
         ):  # fmt: skip
             value, limit = getattr(self, name), getattr(limits, name)
             if not value <= limit:
-                broken.append(f"{name} must be at most {limit:g}, got {value:.4g}")
+                scenes = self.unmatched_scenes if name == "unmatched" else (self.worst_scene,)
+                where = f" (scene {', '.join(map(str, scenes[:5]))})" if "p99" not in name else ""
+                broken.append(f"{name} must be at most {limit:g}, got {value:.4g}{where}")
         for name, (ours, theirs) in self.ap.items():
             if not abs(ours - theirs) <= limits.ap:
                 broken.append(f"{name} must agree within {limits.ap:g}, got {ours:.4f} and {theirs:.4f}")
@@ -87,7 +93,8 @@ class Parity:
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for the card and the report."""
-        return asdict(self) | {"ap": {name: [float(a), float(b)] for name, (a, b) in self.ap.items()}}
+        ap = {name: [float(a), float(b)] for name, (a, b) in self.ap.items()}
+        return asdict(self) | {"ap": ap, "unmatched_scenes": list(self.unmatched_scenes)}
 
 
 def measure_parity(
@@ -106,12 +113,18 @@ def measure_parity(
         samples: batches of one, of scenes that were held out.
         part: for distances and symmetries.
         peak_threshold, confidence_threshold: what counts as a detection.
+
+    Raises:
+        ValueError: when an output of the graph is not finite.
     """
     sides: tuple[list[SceneResult], list[SceneResult]] = ([], [])
     for batch in samples:
         with torch.no_grad():
             sides[0].extend(scene_results(model(batch.points, batch.normals, batch.found), batch, peak_threshold))
         outputs = graph(batch.points.numpy(), batch.normals.numpy())
+        for name, values in outputs.items():
+            if not np.isfinite(values).all():
+                raise ValueError(f"the graph's {name} must be finite, got NaN or inf in scene {len(sides[1])}")
         theirs = Predictions(**{name: torch.from_numpy(outputs[name]) for name in Predictions._fields})
         sides[1].extend(scene_results(theirs, batch, peak_threshold))
     return compare(sides[0], sides[1], part, confidence_threshold)
@@ -126,11 +139,11 @@ def compare(
     that stands a rounding error below the threshold is a partner still.
     """
     metric = PoseMetric.of(part)
-    shift, turn, trust, unmatched = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], 0
+    shift, turn, trust, unmatched = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [0]
     for a, b in zip(ours, theirs, strict=True):
         i, j = _partners(metric, a, b, PARTNER * part.diameter)
         sure_a, sure_b = a.scores >= confidence_threshold, b.scores >= confidence_threshold
-        unmatched += int(sure_a.sum() - sure_a[i].sum() + sure_b.sum() - sure_b[j].sum())
+        unmatched.append(int(sure_a.sum() - sure_a[i].sum() + sure_b.sum() - sure_b[j].sum()))
         kept = sure_a[i] | sure_b[j]
         i, j = i[kept], j[kept]
         shift.append(1000 * np.linalg.norm(a.poses[i, :3, 3] - b.poses[j, :3, 3], axis=-1))
@@ -141,13 +154,15 @@ def compare(
     return Parity(
         scenes=len(ours),
         pairs=len(shifts),
-        unmatched=unmatched,
+        unmatched=sum(unmatched),
         translation_mm=float(shifts.max(initial=0.0)),
         translation_p99_mm=_percentile(shifts),
         rotation_degrees=float(turns.max(initial=0.0)),
         rotation_p99_degrees=_percentile(turns),
         confidence=float(trusts.max(initial=0.0)),
         ap={name: (float(figures[0][name]), float(figures[1][name])) for name in NAMES},
+        worst_scene=int(np.argmax([values.max(initial=0.0) for values in shift[1:]])) if ours else 0,
+        unmatched_scenes=tuple(i for i, count in enumerate(unmatched[1:]) if count),
     )
 
 

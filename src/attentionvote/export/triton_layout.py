@@ -16,16 +16,23 @@ from attentionvote.inference.bundle import Bundle
 def write_triton(bundle: Bundle, repository: Path, version: int = 1) -> Path:
     """Write ``repository/PART`` with ``config.pbtxt``, ``VERSION/model.onnx`` and the card; its path.
 
+    The folder is exchanged as a whole, so that a server that polls it never reads halves.
+
     Raises:
         OSError: when it cannot be written.
     """
     folder = repository / bundle.card.part.name
-    place = folder / str(version)
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
-    (place / "model.onnx").write_bytes(bundle.model)
-    (folder / "card.json").write_text(bundle.card.to_json(), encoding="utf-8")
-    (folder / "config.pbtxt").write_text(config(bundle.card, version), encoding="utf-8")
+    draft, old = (repository / f".{folder.name}.{state}" for state in ("writing", "old"))
+    for leftover in (draft, old):
+        shutil.rmtree(leftover, ignore_errors=True)
+    (draft / str(version)).mkdir(parents=True)
+    (draft / str(version) / "model.onnx").write_bytes(bundle.model)
+    (draft / "card.json").write_text(bundle.card.to_json(), encoding="utf-8")
+    (draft / "config.pbtxt").write_text(config(bundle.card, version), encoding="utf-8")
+    if folder.exists():
+        folder.rename(old)
+    draft.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
     return folder
 
 

@@ -16,14 +16,18 @@ from attentionvote.inference.estimator import PoseEstimator
 
 TRANSLATION_TOLERANCE = 0.001
 ROTATION_TOLERANCE = math.radians(1.0)
-CLEAR_OF_THRESHOLD = 0.1
+
+
+def clear_confidence(threshold: float) -> float:
+    """From which confidence on a pose cannot miss the threshold by rounding: 0.1 above, less where 1 is near."""
+    return threshold + (min(0.1, 0.25 * (1 - threshold)) if threshold < 1 else 0.1 * threshold)
 
 
 def self_test(estimator: PoseEstimator, bundle: Bundle) -> list[str]:
     """What is wrong with the answers to the golden clouds, one sentence each; empty when all are as expected.
 
-    A pose must come back within 1 mm and 1 degree, least over the part's symmetries. Poses whose confidence is
-    within 0.1 of the threshold may come and go: another processor rounds differently.
+    A pose must come back within 1 mm and 1 degree, least over the part's symmetries. Poses whose confidence is near the
+    threshold (below ``clear_confidence``) may come and go: another processor rounds differently.
 
     Args:
         estimator: of the bundle; its crop is not applied, golden clouds hold parts only.
@@ -44,7 +48,7 @@ def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetry: Symmetry) 
         return [f"golden cloud {cloud.name} could not be estimated: {error}"]
     detections = answer.detections if isinstance(answer, Estimate) else ()
     poses = np.array([d.camera_from_part for d in detections]).reshape(-1, 4, 4)
-    clear = estimator.card.confidence_threshold + CLEAR_OF_THRESHOLD
+    clear = clear_confidence(estimator.card.confidence_threshold)
     translation, rotation = pose_errors(cloud.camera_from_part, poses, symmetry)
     good = (translation <= TRANSLATION_TOLERANCE) & (rotation <= ROTATION_TOLERANCE)
     # The expected poses choose their nearest answers, the clearest first; an answer serves one of them.

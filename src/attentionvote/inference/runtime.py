@@ -73,6 +73,9 @@ class Session:
             raise BundleError(
                 f"model.onnx must be a graph that onnxruntime {runtime_version()} can load, but it says: {_line(error)}"
             ) from error
+        used = self._session.get_providers()[0]
+        if used != provider:  # onnxruntime falls back without a word
+            raise BundleError(f"onnxruntime must run the graph with {provider}, but here it falls back to {used}")
         _check_tensors("input", self._session.get_inputs(), card.inputs)
         _check_tensors("output", self._session.get_outputs(), card.outputs)
         self._inputs = card.inputs
