@@ -17,8 +17,14 @@ PYTEST_ARGS ?=
 object := $(if $(OBJECT),object=$(OBJECT))
 
 smoke_object = $(or $(OBJECT),connecting_rod)
-# A bundle's folder is named after its part, so these targets cannot do without one.
-bundle = $(if $(OBJECT),outputs/export/$(OBJECT)/latest,$(error OBJECT must be given, e.g. make $@ OBJECT=connecting_rod))
+bundle := outputs/export/$(OBJECT)/latest
+# A bundle's folder is named after its part: said before any set-up.
+needs_object := $(filter serve bench-serve,$(MAKECMDGOALS))
+ifneq ($(needs_object),)
+ifeq ($(OBJECT),)
+$(error OBJECT must be given, e.g. make $(firstword $(needs_object)) OBJECT=connecting_rod)
+endif
+endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
