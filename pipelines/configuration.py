@@ -25,7 +25,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from schema import violation
+from schema import range_of, violation
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -191,8 +191,11 @@ def _select(plain: Any, key: str) -> Any:
 
 
 def _check_types(key: str, default: Any, value: Any) -> None:
-    """Refuse ``value`` where it has another type than ``default``; null as a default accepts anything."""
-    if default is None:
+    """Refuse ``value`` where it has another type than ``default``; null as a default accepts anything.
+
+    Null as a value is for settings that say their type in the table of ranges: these mean something without one.
+    """
+    if default is None or (value is None and range_of(key).kind is not None):
         return
     if isinstance(default, Mapping):
         if not isinstance(value, Mapping):

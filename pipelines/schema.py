@@ -26,7 +26,7 @@ class Range:
         low, high: inclusive bounds of a number.
         above: exclusive bound of a number.
         options: the texts that are allowed.
-        kind: ``int``, ``float``, ``str`` or ``dict``, for settings whose default is null and so carries no type.
+        kind: ``int``, ``float``, ``str`` or ``dict``, for settings that may be null: null carries no type.
     """
 
     pattern: str
@@ -111,6 +111,7 @@ RANGES: tuple[Range, ...] = (
     Range("model.base_radius", above=0, high=10, kind=float),
     Range("model.voxel_size", above=0, high=10, kind=float),
     Range("model.voting_radius", above=0, high=10, kind=float),
+    Range("model.merge_fraction", above=0, high=10, kind=float),
     Range("model.*_fraction", above=0, high=10),
     Range("model.center_seed", options=("voxel", "mean")),
     Range("model.rotation", options=("quaternion", "six")),

@@ -122,3 +122,30 @@ def test_a_sentence_is_one_line_and_never_empty() -> None:
     assert sentence(ValueError("a\n   b")) == "a b"
     assert sentence(KeyError()) == "KeyError"
     assert sentence(FileNotFoundError(2, "No such file", "x.stl")) == "file not found: x.stl"
+
+
+ROOT = Path(__file__).resolve().parents[2]
+ABLATIONS = [
+    line.partition("#")[0].partition("$T")[2].split()
+    for line in (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").splitlines()
+    if line.startswith(".venv/bin/python pipelines/train.py -m $T")
+]
+
+
+@pytest.mark.parametrize("words", ABLATIONS, ids=" ".join)
+def test_the_ablations_of_the_benchmarks_are_trainings(words: list[str]) -> None:
+    from training_job import find_training
+
+    plain = ["object=connecting_rod", "experiment=compact"]
+    job, base = (find_training(compose("train", [*plain, *more])) for more in (words, []))
+    assert (job.directory == base.directory) == (not words)
+
+
+def test_there_are_ablations_in_the_benchmarks() -> None:
+    assert len(ABLATIONS) >= 5
+
+
+@pytest.mark.parametrize("word", ["trainer.learning_rate=null", "model.voxel_fraction=null", "data.points=null"])
+def test_null_is_for_settings_that_mean_something_without_a_value(word: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"must be a .* got null"):
+        compose("train", ["object=gear", word])
