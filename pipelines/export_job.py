@@ -77,7 +77,10 @@ class ExportJob:
                     f"run must name one complete training, {cfg.run!r} names {len(named)}; there are {have}"
                 )
             complete = {named[0]: complete[named[0]]}
-        newest = max(complete, key=lambda path: (path / RESULT).stat().st_mtime)
+        newest, *older = sorted(complete, key=lambda path: (path / RESULT).stat().st_mtime, reverse=True)
+        if older:
+            have = ", ".join(_described(path, complete[path]) for path in older[:5])
+            log.info("the newest training is taken, %s; RUN=... takes %s", _described(newest, complete[newest]), have)
         return cls(cfg, part, newest, complete[newest], _signing_key(cfg.signing_keys))
 
     @property
@@ -227,6 +230,13 @@ class ExportWork:
             record = self.scenes.records[index]
             cloud = held_out.sensor_cloud(self.scenes, index, caster, self.settings)
             yield f"scene_{record.cycle:03d}_{record.drop_count:03d}", cloud
+
+
+def _described(training: Path, result: dict[str, Any]) -> str:
+    """A training in a few words, with its average precision at 10, 5 and 2 % of D."""
+    metrics = result.get("metrics") or {}
+    figures = "/".join(f"{metrics[f'ap_{k}']:.3f}" for k in (10, 5, 2) if f"ap_{k}" in metrics)
+    return f"{training.name} (AP {figures or 'unknown'})"
 
 
 def _signing_key(folder: str | None) -> Ed25519PrivateKey:

@@ -217,6 +217,20 @@ def test_a_training_that_cannot_be_meant_is_one_sentence(two_trainings: list[str
     assert message in str(caught.value)
 
 
+def test_the_newest_of_several_trainings_is_taken_and_the_others_are_named(
+    two_trainings: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from export_job import ExportJob
+
+    older = tmp_path / "train" / "brick" / "aaaa33334444" / "result.json"
+    older.write_text(json.dumps({"run_id": "cafe2", "metrics": {"ap_10": 0.9, "ap_5": 0.8, "ap_2": 0.25}}))
+    os.utime(older, (1, 1))
+    with caplog.at_level("INFO", logger="attentionvote.export"):
+        assert ExportJob.find(compose("export", two_trainings)).training.name == "aaaa11112222"
+    said = "the newest training is taken, aaaa11112222 (AP unknown); RUN=... takes aaaa33334444 (AP 0.900/0.800/0.250)"
+    assert said in caplog.messages
+
+
 def test_a_damaged_training_is_passed_over(two_trainings: list[str], tmp_path: Path) -> None:
     from export_job import ExportJob
 
