@@ -10,7 +10,8 @@ revision=$(git rev-parse HEAD 2>/dev/null || echo unknown)
 [ "$revision" = unknown ] || git diff --quiet HEAD || revision="$revision+dirty"
 [ -z "${BASE:-}" ] || set -- --build-arg "BASE=$BASE" "$@"
 [ -z "${PIP_CONF:-}" ] || set -- --secret "id=pip,src=$PIP_CONF" "$@"
-set -- --build-arg "VERSION=$version" --build-arg "REVISION=$revision" -f docker/Dockerfile -t "$image" "$@" .
+set -- --label "org.opencontainers.image.version=$version" --label "org.opencontainers.image.revision=$revision" \
+    -f docker/Dockerfile -t "$image" "$@" .
 
 if [ "${BUILDER:-docker}" = docker ] && docker info >/dev/null 2>&1; then
     exec docker build "$@"
