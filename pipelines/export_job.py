@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,9 @@ from export_proof import judge, prove
 from folder_lock import locked_folder
 from hardware import cores
 from hydra.utils import instantiate
+from json_files import read_json, write_json
 from omegaconf import DictConfig
-from training_job import MODEL, RESULT, read_json, write_json
+from training_job import MODEL, RESULT
 
 import attentionvote
 from attentionvote.inference import Bundle, BundleError, load_bundle
@@ -155,7 +157,7 @@ class ExportJob:
 
         return {"triton": str(write_triton(bundle, Path(self.cfg.triton)))}
 
-    @property
+    @cached_property
     def _record(self) -> Path:
         """Named by a digest of everything that decides what is exported: weights, code, versions, settings."""
         from attentionvote.export.model_card import package_versions
@@ -215,12 +217,13 @@ class ExportWork:
         write_json(report, {"training": str(self.job.training), "scenes": self.indices, **figures})
         judge(parity, self.limits, report)
         card = replace(self.card, parity={"limits": figures["limits"], "paths": figures["parity"]})
-        place = self.job.folder
-        bundle = write_bundle(graph, card, self.job.part, self._golden(), self.job.cfg.golden, self.job.key, place)
+        clouds, count = self._golden(), self.job.cfg.golden
+        bundle = write_bundle(graph, card, self.job.part, clouds, count, self.job.key, self.job.folder)
         return self.job.finish(bundle, figures)
 
     def _golden(self) -> Iterator[tuple[str, Any]]:
         """Whole clouds of held-out scenes: first the most different fillings, then whatever else there is."""
+        from attentionvote.data.clouds import sense
         from attentionvote.export import held_out
         from attentionvote.simulation import PartCaster
 
@@ -228,8 +231,7 @@ class ExportWork:
         first = [self.indices[i] for i in held_out.spread(len(self.indices), self.job.cfg.golden)]
         for index in dict.fromkeys([*first, *self.indices]):
             record = self.scenes.records[index]
-            cloud = held_out.sensor_cloud(self.scenes, index, caster, self.settings)
-            yield f"scene_{record.cycle:03d}_{record.drop_count:03d}", cloud
+            yield f"scene_{record.cycle:03d}_{record.drop_count:03d}", sense(record, caster, self.settings)[0].points
 
 
 def _described(training: Path, result: dict[str, Any]) -> str:

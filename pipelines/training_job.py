@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import shutil
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any
 
 from folder_lock import locked_folder
 from hydra.utils import instantiate
+from json_files import read_json
 from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.part import Part
@@ -113,27 +113,3 @@ def _check(cfg: DictConfig, specs: dict[str, SceneSetSpec]) -> None:
         raise ValueError(
             f"data.points must be at least model.centers[0] ({cfg.model.centers[0]}), got {cfg.data.points}"
         )
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def read_json(path: Path) -> dict[str, Any] | None:
-    """The object in a JSON file; None when there is no such file, or, with a warning, when it is damaged."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except ValueError:
-        content = None
-    if not isinstance(content, dict):
-        log.warning("%s is damaged and is passed over", path)
-        return None
-    return content

@@ -13,10 +13,11 @@ import lightning as L
 import torch
 from hardware import cores
 from hydra.utils import instantiate
+from json_files import write_json
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
-from training_job import MODEL, RESULT, RUN, TrainingJob, write_json
+from training_job import MODEL, RESULT, RUN, TrainingJob
 from training_messages import plain_loader_errors, quiet_lightning
 from training_results import assess, log_losses
 
