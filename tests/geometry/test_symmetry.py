@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from attentionvote.geometry.pose import rotation_about
+from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion, rotation_about, rotation_angle
 from attentionvote.geometry.symmetry import Symmetry
 
 AXES = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 1e-3)
@@ -120,3 +120,28 @@ def test_a_group_of_impossible_quaternions_is_refused(bad: list[float]) -> None:
 def test_a_group_with_repeats_is_refused() -> None:
     with pytest.raises(ValueError, match="each rotation once"):
         Symmetry("group", quaternions=[[1, 0, 0, 0], [-1, 0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "symmetry",
+    [
+        Symmetry(),
+        Symmetry("cyclic", (1, 2, 2), order=3),
+        Symmetry("dihedral", order=2),
+        Symmetry("revolution", (1, 2, 2)),
+        Symmetry("revolution", (0, 0, 1), flip=True),
+    ],
+    ids=lambda s: f"{s.kind} {s.flip}",
+)
+def test_an_angle_is_least_over_all_symmetric_poses(symmetry: Symmetry) -> None:
+    """The oracle turns one pose through everything that leaves the part where it is, a body of revolution in steps."""
+    a, b = matrix_from_quaternion(random_quaternion(np.random.default_rng(4), (2, 5)))
+    turns = (
+        rotation_about(symmetry.axis, np.linspace(0, 2 * np.pi, 7201)) if symmetry.is_revolution else np.eye(3)[None]
+    )
+    alike = b[:, None, None] @ symmetry.rotations()[:, None] @ turns
+    expected = rotation_angle(a[:, None, None], alike).min((-2, -1))
+    np.testing.assert_allclose(symmetry.angle(a, b), expected, atol=1e-3 if symmetry.is_revolution else 1e-12)
+    table = symmetry.angle(a[:, None], b[None])
+    np.testing.assert_array_equal(np.diagonal(table), symmetry.angle(a, b))
+    assert symmetry.angle(a[:0], b[:0]).shape == (0,)

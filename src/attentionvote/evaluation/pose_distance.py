@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from attentionvote.evaluation.result_files import read_json
 from attentionvote.evaluation.scene_result import Array
-from attentionvote.geometry.pose import inverse, quaternion_from_matrix, rotation_angle, transform
+from attentionvote.geometry.pose import inverse, quaternion_from_matrix, transform
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part, surface_moments
 
@@ -135,12 +135,7 @@ def rotation_errors(a: ArrayLike, b: ArrayLike, symmetry: Symmetry) -> Array:
     For a body of revolution: the angle between the axes (of at most 90 degrees with ``flip``).
     """
     r_a, r_b = (np.asarray(p, dtype=np.float64).reshape(-1, 4, 4)[:, :3, :3] for p in (a, b))
-    if not symmetry.is_revolution:
-        return rotation_angle(r_a[:, None], r_b[:, None] @ symmetry.rotations()).min(-1)
-    axis_a, axis_b = r_a @ np.asarray(symmetry.axis), r_b @ np.asarray(symmetry.axis)
-    # The half-chord form is accurate near zero, where arccos is not.
-    angle = 2 * np.arcsin(np.clip(np.linalg.norm(axis_a - axis_b, axis=-1) / 2, 0.0, 1.0))
-    return np.minimum(angle, np.pi - angle) if symmetry.flip else angle
+    return symmetry.angle(r_a, r_b)
 
 
 def _matrix(path: str | Path, content: dict, key: str, shape: tuple[int, ...]) -> Array:

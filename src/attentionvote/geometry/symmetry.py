@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.geometry.pose import matrix_from_quaternion, rotation_about
+from attentionvote.geometry.pose import matrix_from_quaternion, rotation_about, rotation_angle
 
 Kind = Literal["none", "cyclic", "dihedral", "group", "revolution"]
 Axis = tuple[float, float, float]
@@ -114,3 +114,16 @@ class Symmetry:
         x = np.asarray(self.perpendicular)
         z = np.asarray(self.axis)
         return np.stack([x, np.cross(z, x), z], axis=-1)
+
+    def angle(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Angles ``(...)`` in radians between rotations ``(..., 3, 3)``, least over the symmetries.
+
+        For a body of revolution: the angle between the axes (of at most 90 degrees with ``flip``).
+        """
+        if not self.is_revolution:
+            return np.asarray(rotation_angle(a[..., None, :, :], b[..., None, :, :] @ self.rotations()).min(-1))
+        axis = np.asarray(self.axis)
+        # The half-chord form is accurate near zero, where arccos is not.
+        chord = np.linalg.norm(a @ axis - b @ axis, axis=-1)
+        angle = 2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0))
+        return np.asarray(np.minimum(angle, np.pi - angle) if self.flip else angle)

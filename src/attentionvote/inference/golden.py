@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.geometry.pose import rotation_angle
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.inference.answer import Estimate
 from attentionvote.inference.bundle import Bundle, GoldenCloud
@@ -89,13 +88,4 @@ def pose_errors(
     Angles are least over the symmetries; for a body of revolution between the axes, of at most 90 degrees with flip.
     """
     translation = np.linalg.norm(expected[:, None, :3, 3] - found[None, :, :3, 3], axis=-1)
-    turns, others = expected[:, None, :3, :3], found[None, :, :3, :3]
-    if not symmetry.is_revolution:
-        alike = others[:, :, None] @ symmetry.rotations()
-        return translation, rotation_angle(turns[:, :, None], alike).min(axis=-1, initial=np.pi)
-    axis = np.asarray(symmetry.axis)
-    a, b = turns @ axis, others @ axis
-    chord = np.linalg.norm(a - b, axis=-1)
-    if symmetry.flip:
-        chord = np.minimum(chord, np.linalg.norm(a + b, axis=-1))
-    return translation, 2 * np.arcsin(np.clip(chord / 2, 0, 1))
+    return translation, symmetry.angle(expected[:, None, :3, :3], found[None, :, :3, :3])
