@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from attentionvote.contract import ModelCard, PartCard, TensorSpec
+from attentionvote.contract import ModelCard, PartCard, TensorSpec, is_detection
 
 PART = PartCard(
     name="bracket",
@@ -192,3 +192,10 @@ def test_no_value_raises_anything_else(name: str, part: str, value: Any) -> None
             ModelCard.from_json(text)
         except ValueError as error:
             assert str(error)  # noqa: PT017
+
+
+def test_a_detection_has_heat_and_confidence_and_zero_is_never_enough() -> None:
+    heat = np.array([0.4, 0.39, 0.0, 0.5, 0.5, np.nan])
+    confidence = np.array([0.5, 0.9, 0.9, 0.49, 0.0, 0.9])
+    np.testing.assert_array_equal(is_detection(heat, confidence, 0.4, 0.5), [True, False, False, False, False, False])
+    np.testing.assert_array_equal(is_detection(heat, confidence, 0.0, 0.0), [True, True, False, True, False, False])

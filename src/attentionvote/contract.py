@@ -13,6 +13,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 VERSION = 1
 UNITS = "m"
 FRAME = "camera: x right, y down, z forward (OpenCV)"
@@ -189,6 +192,19 @@ class ModelCard:
                 )
         content = _plain("card", cls, content)
         return cls(**content | {"part": PartCard(**_plain("card part", PartCard, content["part"]))})
+
+
+def is_detection(
+    heat: NDArray[np.floating], confidence: NDArray[np.floating], peak_threshold: float, confidence_threshold: float
+) -> NDArray[np.bool_]:
+    """Which proposals count as detections, in training's figures and in the cell alike.
+
+    Args:
+        heat, confidence: of the proposals, any shape.
+        peak_threshold, confidence_threshold: least values; 0 is never enough: it marks a place without a peak, and a
+            proposal that was merged into another.
+    """
+    return (heat >= peak_threshold) & (heat > 0) & (confidence >= confidence_threshold) & (confidence > 0)
 
 
 def _plain(what: str, kind: type, content: object) -> dict[str, Any]:

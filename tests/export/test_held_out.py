@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from attentionvote.data.clouds import sense
 from attentionvote.export import held_out, model_card
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
@@ -95,7 +96,7 @@ def test_samples_and_sensor_clouds_are_of_the_same_measurement(
     again = list(held_out.samples(clouds, [3], 300, network.layout))
     assert [d.points.shape for d in drawn] == [(1, 300, 3)] * 2
     np.testing.assert_array_equal(drawn[1].points, again[0].points)
-    whole = held_out.sensor_cloud(scenes, 3, PartCaster(part), settings)
+    whole = sense(scenes.records[3], PartCaster(part), settings)[0].points
     assert 500 < len(whole) <= settings.density
     sampled = {tuple(p) for p in drawn[1].points[0].numpy().tolist()}
     assert sampled <= {tuple(p) for p in whole.tolist()}

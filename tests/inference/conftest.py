@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from attentionvote.contract import CARD_KEY, ModelCard, PartCard
@@ -251,3 +252,27 @@ def bundle_folder(make_bundle: MakeBundle) -> Path:
 def other_card() -> ModelCard:
     """A card that differs from the tiny one."""
     return replace(tiny_card(), confidence_threshold=0.25)
+
+
+def damage(whole: bytes, data: st.DataObject) -> bytes:
+    """A file after some bytes were changed, removed or inserted; never empty."""
+    content = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 6))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        action = data.draw(st.sampled_from(["change", "remove", "insert"]))
+        if action == "change":
+            content[place] = data.draw(st.integers(0, 255))
+        elif action == "remove":
+            del content[place : place + data.draw(st.integers(1, 8))]
+        else:
+            content[place:place] = data.draw(
+                st.binary(max_size=6) | st.sampled_from([b"9", b"\n", b"-1", b"nan ", b"\xa0"])
+            )
+        if not content:
+            content = bytearray(b"p")
+    return bytes(content)
+
+
+@pytest.fixture(scope="session")
+def damaged() -> Callable[[bytes, st.DataObject], bytes]:
+    return damage

@@ -98,13 +98,18 @@ class Clouds:
             ) from error
 
 
+def sense(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> tuple[Scene, np.random.Generator]:
+    """One scene as the sensor delivers it, up to ``density`` points, and the scene's own random numbers after it."""
+    rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
+    return synthesize(record, caster, settings.sensor, settings.density, rng), rng
+
+
 def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> Scene:
     """One scene as the network will see it: noisy points of the pool with normals from the whole cloud.
 
     The random numbers come from the scene's own seed, so the cloud does not depend on who measures it and when.
     """
-    rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
-    scene = synthesize(record, caster, settings.sensor, settings.density, rng)
+    scene, rng = sense(record, caster, settings)
     if len(scene.points) < 3:
         empty = np.zeros((0, 3), dtype=np.float32)
         return Scene(

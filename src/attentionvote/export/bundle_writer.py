@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from attentionvote.contract import ModelCard
 from attentionvote.inference import BundleError, Estimate, PoseEstimator
 from attentionvote.inference.bundle import Bundle, load_bundle
+from attentionvote.inference.durable import sync
 from attentionvote.inference.golden import clear_confidence, self_test
 from attentionvote.inference.manifest import CARD, GOLDEN, MESH, MODEL, write_manifest
 from attentionvote.part import Part
@@ -68,12 +68,12 @@ def write_bundle(
         if problems:
             raise ValueError(f"the bundle must pass its own self-test, but {problems[0]}")
         place = folder / bundle.digest[:12]
-        if not is_whole(place, key):
+        if not _is_whole(place, key):
             _settle(draft)
             if place.exists():
                 place.rename(old)
             draft.rename(place)
-            _sync(folder)
+            sync(folder)
     finally:
         for leftover in (draft, old):
             shutil.rmtree(leftover, ignore_errors=True)
@@ -81,7 +81,7 @@ def write_bundle(
     return load_bundle(place, key.public_key())
 
 
-def is_whole(place: Path, key: Ed25519PrivateKey) -> bool:
+def _is_whole(place: Path, key: Ed25519PrivateKey) -> bool:
     """Whether a folder holds a bundle that this key signed, with nothing missing, damaged or added."""
     try:
         load_bundle(place, key.public_key())
@@ -96,7 +96,7 @@ def point_latest(place: Path) -> None:
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(place.name)
     temporary.replace(link)
-    _sync(place.parent)
+    sync(place.parent)
 
 
 def _write_golden(
@@ -127,12 +127,4 @@ def _write_golden(
 def _settle(folder: Path) -> None:
     """Everything on the disk before the folder gets its name: a power cut leaves no half bundle under it."""
     for path in [*sorted(folder.rglob("*")), folder]:
-        _sync(path)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync(path)

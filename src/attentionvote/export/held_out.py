@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from attentionvote.data import Clouds, CloudSettings, collate, draw_sample, measure_clouds
 from attentionvote.data.samples import Batch
 from attentionvote.model import Layout
 from attentionvote.part import Part
-from attentionvote.simulation import PartCaster, SceneSet, Sensor, synthesize
+from attentionvote.simulation import SceneSet, Sensor
 
 
 def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:
@@ -70,13 +69,6 @@ def samples(clouds: Clouds, indices: list[int], points: int, layout: Layout) -> 
         if clouds.count(index) >= 3:
             rng = np.random.default_rng([0, index])
             yield collate([draw_sample(clouds[index], points, layout, None, rng)])
-
-
-def sensor_cloud(scenes: SceneSet, index: int, caster: PartCaster, settings: CloudSettings) -> NDArray[np.float32]:
-    """The whole cloud of a scene as the sensor delivers it, ``(P, 3)`` metres, parts only."""
-    record = scenes.records[index]
-    rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
-    return synthesize(record, caster, settings.sensor, settings.density, rng).points
 
 
 def working_volume(clouds: Clouds) -> tuple[tuple[float, float], float]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.contract import FRAME, UNITS, ModelCard
+from attentionvote.contract import FRAME, UNITS, ModelCard, is_detection
 from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix, transform
 
 Reason = Literal["too_few_points", "nothing_found", "deadline_exceeded"]
@@ -112,8 +112,6 @@ def _facts(answer: Estimate | Abstention) -> dict[str, Any]:
 def detections_from(outputs: Mapping[str, NDArray[np.float32]], card: ModelCard) -> tuple[tuple[Detection, ...], int]:
     """The graph's proposals that pass the card's thresholds, most confident first.
 
-    The rule is the one by which training measured the model (``training/detections.py``).
-
     Args:
         outputs: of the graph, batch 1.
         card: of the model.
@@ -123,7 +121,7 @@ def detections_from(outputs: Mapping[str, NDArray[np.float32]], card: ModelCard)
     """
     heat, confidence = outputs["peak_heat"][0], outputs["confidence"][0]
     center, quaternion = outputs["center"][0].astype(np.float64), outputs["quaternion"][0].astype(np.float64)
-    kept = (heat >= card.peak_threshold) & (heat > 0) & (confidence >= card.confidence_threshold) & (confidence > 0)
+    kept = is_detection(heat, confidence, card.peak_threshold, card.confidence_threshold)
     length = np.linalg.norm(quaternion, axis=1)
     sound = np.isfinite(center).all(axis=1) & np.isfinite(length) & (length > 1e-6)
     sound &= np.isfinite(heat) & np.isfinite(confidence)

@@ -46,20 +46,7 @@ class SetAbstraction(nn.Module):
         neighbors: Int[Tensor, "batch centers neighbors"],
     ) -> Float[Tensor, "batch centers out"]:
         """Features of the centres; ``neighbors`` are indices into ``points``."""
-        pooled = self.pool(xyz, normals, features, centers, center_normals, neighbors)
-        return self.finish(pooled).view(*centers.shape[:2], -1)
-
-    def pool(
-        self,
-        xyz: Float[Tensor, "batch points 3"],
-        normals: Float[Tensor, "batch points 3"],
-        features: Float[Tensor, "batch points channels"] | None,
-        centers: Float[Tensor, "batch centers 3"],
-        center_normals: Float[Tensor, "batch centers 3"],
-        neighbors: Int[Tensor, "batch centers neighbors"],
-    ) -> Float[Tensor, "rows out"]:
-        """The shared MLP's maximum over each centre's neighbours, one row a centre."""
-        batch = len(centers)
+        batch, count, _ = centers.shape
         first_row = torch.arange(batch, device=xyz.device)[:, None, None] * xyz.shape[1]
         index = (neighbors + first_row).flatten(0, 1)
         flat = [t.reshape(-1, 3) for t in (xyz, normals, centers, center_normals)]
@@ -67,7 +54,8 @@ class SetAbstraction(nn.Module):
         projected = None
         if self.project is not None and features is not None:
             projected = self.project(features.reshape(-1, features.shape[-1]))
-        return pooled_mlp(geometry, projected, index, list(self.weights))
+        pooled = pooled_mlp(geometry, projected, index, list(self.weights))
+        return self.finish(pooled).view(batch, count, -1)
 
     def finish(self, pooled: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
         """What follows the maximum: norm, ReLU, residual block."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from attentionvote.contract import is_detection
 from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult
 from attentionvote.geometry.pose import matrix_from_quaternion, transform
@@ -26,7 +27,7 @@ def scene_results(
     heat, confidence = predictions.peak_heat.float().cpu().numpy(), predictions.confidence.float().cpu().numpy()
     rotation = matrix_from_quaternion(predictions.quaternion.double().cpu().numpy())
     poses = transform(rotation, predictions.center.double().cpu().numpy())
-    kept = (heat >= peak_threshold) & (heat > 0) & (confidence >= confidence_threshold) & (confidence > 0)  # 0 = merged
+    kept = is_detection(heat, confidence, peak_threshold, confidence_threshold)
     truth = transform(batch.rotation.double().cpu().numpy(), batch.center.double().cpu().numpy())
     real = (batch.center.abs().sum(-1) > 0).cpu().numpy()
     visible = batch.visible.double().cpu().numpy()

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from attentionvote.inference.bundle import Bundle, Trusted, load_bundle
+from attentionvote.inference.durable import sync
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.manifest import MANIFEST, SIGNATURE, files_in, most_bytes, opened, read_file
 
@@ -110,7 +111,7 @@ class LastKnownGood:
                 if load_bundle(staging, trusted).digest != bundle.digest:
                     raise OSError(f"{source} was exchanged while it was copied")
                 os.rename(staging, target)
-        _sync(self._kept)
+        sync(self._kept)
         damaged = {p for p in entries if p.name.endswith(target.name[9:])} - {target}
         others = [p for p in self.entries() if p not in damaged]
         for old in [*damaged, *others[KEPT:]]:
@@ -148,13 +149,4 @@ def _copy(source: Path, target: Path) -> None:
                 file.flush()
                 os.fsync(file.fileno())
     for folder in folders:
-        _sync(folder)
-
-
-def _sync(folder: Path) -> None:
-    """Wait until a folder's names are on the disk."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync(folder)
