@@ -5,6 +5,7 @@ Numpy and scipy only. Definitions follow the toolbox of Bregier et al. (2017).
 
 from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
 from attentionvote.evaluation.average_precision import DetectionScores, average_precision
+from attentionvote.evaluation.bootstrap import Interval, interval, resampled_figures, scene_weights
 from attentionvote.evaluation.matching import Matching, ScoreCurve, match, score_curve
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
 from attentionvote.evaluation.result_files import (
@@ -22,6 +23,7 @@ __all__ = [
     "Curves",
     "DetectionScores",
     "Distance",
+    "Interval",
     "Matching",
     "NearestPointDistance",
     "PoseMetric",
@@ -30,11 +32,14 @@ __all__ = [
     "average_precision",
     "curves",
     "evaluate",
+    "interval",
     "match",
     "read_ground_truth",
     "read_results",
     "read_scene_results",
+    "resampled_figures",
     "rotation_errors",
+    "scene_weights",
     "score_curve",
     "write_ground_truth",
     "write_results",

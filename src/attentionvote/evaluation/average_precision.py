@@ -96,8 +96,7 @@ def summarize(curves: Sequence[ScoreCurve]) -> DetectionScores:
     precision, recall = np.zeros(len(levels)), np.zeros(len(levels))
     right, wrong = np.zeros(len(levels), dtype=np.int64), np.zeros(len(levels), dtype=np.int64)
     for curve in curves:
-        # A scene's value at a score is the value at its own lowest score that is not lower.
-        at = np.searchsorted(-curve.scores, -levels, side="right") - 1
+        at = curve.at(levels)
         precision += curve.precision[at]
         recall += curve.recall[at]
         right += curve.true_positives[at]

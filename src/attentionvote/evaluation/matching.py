@@ -64,6 +64,10 @@ class ScoreCurve:
         """TP / required, 1 when nothing is to be found."""
         return self.true_positives / self.required if self.required else np.ones(len(self.scores))
 
+    def at(self, levels: Array) -> Indices:
+        """Indices ``(L,)`` of the points of this curve that hold at other scores: its lowest score not below each."""
+        return np.searchsorted(-self.scores, -levels, side="right") - 1
+
     @property
     def average_precision(self) -> float:
         """Area under the step curve, from recall 0."""

@@ -45,6 +45,11 @@ class SceneResult:
         self.poses = _numbers("poses", self.poses, (len(self.scores), 4, 4))
         self.gt_poses = _numbers("gt_poses", self.gt_poses, (len(self.gt_occlusion), 4, 4))
 
+    def above(self, score: float) -> SceneResult:
+        """The scene with only the results of at least this score."""
+        kept = self.scores >= score
+        return SceneResult(self.poses[kept], self.scores[kept], self.gt_poses, self.gt_occlusion)
+
     def to_find(self, occlusion_limit: float = 0.5) -> NDArray[np.bool_]:
         """Which ground-truth poses ``(I,)`` must be found: ``-0.1 <= occlusion <= occlusion_limit``."""
         return (self.gt_occlusion >= -0.1) & (self.gt_occlusion <= occlusion_limit)

@@ -22,8 +22,7 @@ def candidates(scenes: Sequence[SceneResult]) -> tuple[float, ...]:
 
 def confident(scenes: Sequence[SceneResult], threshold: float) -> list[SceneResult]:
     """The same scenes with only the detections of at least this confidence."""
-    kept = [scene.scores >= threshold for scene in scenes]
-    return [SceneResult(s.poses[k], s.scores[k], s.gt_poses, s.gt_occlusion) for s, k in zip(scenes, kept, strict=True)]
+    return [scene.above(threshold) for scene in scenes]
 
 
 def best_threshold(scenes: Sequence[SceneResult], part: Part, fraction: float = 0.1) -> float:
