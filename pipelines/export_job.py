@@ -160,7 +160,7 @@ class ExportJob:
     @cached_property
     def _record(self) -> Path:
         """Named by a digest of everything that decides what is exported: weights, code, versions, settings."""
-        from attentionvote.export.model_card import package_versions
+        from attentionvote.export.checkpoint_card import package_versions
 
         code = hashlib.sha256()
         package = Path(attentionvote.__file__).parent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from attentionvote.data.samples import Batch, collate
 from attentionvote.evaluation import SceneResult
-from attentionvote.export.parity import Limits, Parity, compare, measure_parity, table
+from attentionvote.export import Limits, Parity, compare, measure_parity, table
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.model import AttentionVote, find_neighborhoods
 from attentionvote.part import Part
@@ -166,3 +167,16 @@ def test_an_answer_that_is_no_number_is_refused(
 
     with pytest.raises(ValueError, match="the graph's confidence must be finite, got NaN or inf in scene 0"):
         measure_parity(network, damaged, [batch(network, make_cloud(0))], part, 0.05, 0.1)
+
+
+def test_a_record_is_read_as_it_was_written(part: Part) -> None:
+    parity = compare([scene(poses(0.0, 0.2), [0.9, 0.8])], [scene(poses(0.001), [0.9])], part, 0.5)
+    assert parity.unmatched == 1
+    assert Parity.from_dict(json.loads(json.dumps(parity.as_dict()))) == parity
+
+
+@pytest.mark.parametrize("change", [{"ap": None}, {"pairs": "many"}, {"extra": 1}, {"unmatched_scenes": 3}])
+def test_another_record_is_refused(part: Part, change: dict[str, object]) -> None:
+    parity = compare([scene(poses(0.0), [0.9])], [scene(poses(0.0), [0.9])], part, 0.5)
+    with pytest.raises(ValueError, match="a record of parity must h"):
+        Parity.from_dict(parity.as_dict() | change)

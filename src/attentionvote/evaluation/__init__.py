@@ -16,7 +16,7 @@ from attentionvote.evaluation.result_files import (
     write_results,
 )
 from attentionvote.evaluation.scene_result import Distance, SceneResult
-from attentionvote.evaluation.scores import Curves, curves, evaluate
+from attentionvote.evaluation.scores import Curves, curves, evaluate, evaluate_at
 
 __all__ = [
     "AverageDistance",
@@ -32,6 +32,7 @@ __all__ = [
     "average_precision",
     "curves",
     "evaluate",
+    "evaluate_at",
     "interval",
     "match",
     "read_ground_truth",

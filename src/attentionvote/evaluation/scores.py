@@ -78,6 +78,22 @@ def evaluate(
     return metrics | recall_by_visibility(scenes, matchings) | pose_errors(scenes, matchings, part)
 
 
+def evaluate_at(scenes: Sequence[SceneResult], part: Part, working_point: float, add: bool = True) -> dict[str, float]:
+    """``evaluate`` of a detector with a working point, the score from which on a result counts as a detection.
+
+    Average precision is an area over all scores (``ap_N``, ``map_N``, ``f1_N``); everything else, precision and recall
+    first, is of the detections.
+
+    Args:
+        scenes: with all results.
+        part, add: as in ``evaluate``.
+        working_point: the score.
+    """
+    everything = evaluate(scenes, part, add=add)
+    kept = evaluate([scene.above(working_point) for scene in scenes], part, add=add)
+    return {k: v if k.startswith(("ap_", "map_", "f1_")) else kept.get(k, v) for k, v in everything.items()}
+
+
 def recall_by_visibility(scenes: Sequence[SceneResult], matchings: Sequence[Matching]) -> dict[str, float]:
     """Share of the ground truth that was found, in bins of its visible fraction; empty bins are absent."""
     visible, found = [], []
