@@ -120,7 +120,7 @@ class TrainingRun:
                     "data_seconds": round(data_seconds, 1),
                     "train_seconds": round(progress.seconds, 1),
                     "seconds": round(time.monotonic() - start, 1),
-                    "commit": git_state(Path.cwd()).commit,
+                    "commit": git_state(Path.cwd()).label,
                 }
                 tracked.log_text("result.json", json.dumps(result, indent=2))
                 write_json(self.job.directory / RESULT, result)

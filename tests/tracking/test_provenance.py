@@ -18,11 +18,13 @@ def test_git_state_has_the_changes_of_tracked_files_and_the_names_of_others(tmp_
     clean = git_state(tmp_path)
     assert len(clean.commit) == 40
     assert not clean.is_dirty
+    assert clean.label == clean.commit
     assert clean.patch == ""
     (tmp_path / "a.txt").write_text("new ä\n")
     (tmp_path / "b.txt").write_text("untracked\n")
     dirty = git_state(tmp_path)
     assert dirty.is_dirty
+    assert dirty.label == f"{dirty.commit}+dirty"
     assert "-old\n+new ä\n" in dirty.patch
     assert "?? b.txt" in dirty.status
     (tmp_path / "a.txt").write_text("line\n" * 10_000)

@@ -28,6 +28,11 @@ class GitState:
         """Whether the work tree differs from the commit."""
         return bool(self.status)
 
+    @property
+    def label(self) -> str:
+        """The commit, with ``+dirty`` behind it when the work tree differs: what a model's card says."""
+        return f"{self.commit}+dirty" if self.is_dirty else self.commit
+
 
 def _git(folder: Path, *arguments: str, limit: int | None = None) -> str:
     command = ["git", "-C", str(folder), "--no-optional-locks", "-c", "core.quotepath=off", *arguments]
