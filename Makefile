@@ -12,6 +12,7 @@ NAME ?=
 MESH ?=
 UNITS ?=
 RUN ?=
+TO ?=
 ARGS ?=
 PYTEST_ARGS ?=
 object := $(if $(OBJECT),object=$(OBJECT))
@@ -28,7 +29,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train smoke export serve keys bench-serve image generate view part ui test test-fast lint format clean
+.PHONY: help setup system train smoke export evaluate promote rollback history serve keys bench-serve image generate view part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -68,6 +69,18 @@ smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 core
 
 export: $(STAMP) ## Prove the trained model equal to one ONNX file, sign the bundle: OBJECT=connecting_rod [RUN=...]
 	@$(PY) pipelines/export.py $(object) $(if $(RUN),"run='$(RUN)'") $(ARGS)
+
+evaluate: $(STAMP) ## Measure the exported model as cells run it, on a frozen set it has never seen: OBJECT=connecting_rod
+	@$(PY) pipelines/evaluate.py $(object) $(ARGS)
+
+promote: $(STAMP) ## Register the exported model, make it champion if every gate holds: OBJECT=connecting_rod
+	@$(PY) pipelines/promote.py $(object) $(ARGS)
+
+rollback: $(STAMP) ## Bring the champion before back, or a former one: OBJECT=connecting_rod [TO=3]
+	@$(PY) pipelines/rollback.py $(object) $(if $(TO),to=$(TO)) $(ARGS)
+
+history: $(STAMP) ## Show who moved the champion, when, from where to where, and why: OBJECT=connecting_rod
+	@$(PY) pipelines/history.py $(object) $(ARGS)
 
 serve: $(STAMP) ## Serve the newest bundle on this machine, as a cell does: OBJECT=connecting_rod [ARGS="--port 8080"]
 	@$(VENV)/bin/attentionvote serve $(bundle) $(ARGS)

@@ -1,0 +1,49 @@
+"""Evaluate an exported model: the bundle, through the estimator that cells run, on a frozen set it has never seen.
+
+    make evaluate OBJECT=connecting_rod [ARGS="bundle=3fa9c1 evaluation.cycles=20"]
+
+Figures with 95 % bootstrap intervals over scenes, recall by visibility, and the time of an estimate on this machine;
+written into the MLflow run of the training and to outputs/evaluate. What is done is not repeated without force=true.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from command import command, configuring
+from json_files import read_json, write_json
+from omegaconf import DictConfig
+
+log = logging.getLogger("attentionvote.evaluate")
+
+
+def run(cfg: DictConfig) -> dict[str, Any]:
+    """Measure, record, show; the figures."""
+    from evaluation_job import EvaluationJob
+    from evaluation_report import described, record, show
+    from folder_lock import locked_folder
+
+    with configuring():
+        job = EvaluationJob.find(cfg)
+    folder = Path(cfg.outputs) / job.part.name
+    with locked_folder(folder, cfg.outputs, "part's evaluation"):
+        with configuring():
+            frozen = job.evaluation_set()
+        place = folder / f"{job.bundle.digest[:12]}-{frozen.digest[:12]}-{cfg.evaluation.threads}.json"
+        result = read_json(place)
+        if result is not None and not cfg.force:
+            log.info("this evaluation is done (force=true repeats it): %s", place)
+            show(result)
+            return result
+        result = described(job, frozen, job.measure([job.bundle], frozen)[0])
+        write_json(place, result)
+        show(result)
+        record(cfg.tracking.store, job.bundle.card.run_id, result, json.dumps(result, indent=2))
+    return result
+
+
+if __name__ == "__main__":
+    command("evaluate", run)

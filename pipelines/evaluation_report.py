@@ -1,0 +1,87 @@
+"""The figures of an evaluation: as one dictionary, as a table for people, in the MLflow run of the training."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from evaluation_job import EvaluationJob
+
+    from attentionvote.registry.measurement import EvaluationSet, Measurement
+
+log = logging.getLogger("attentionvote.evaluate")
+_TITLES = {
+    "ap_10": "AP at 10 % D",
+    "ap_5": "AP at 5 % D",
+    "ap_2": "AP at 2 % D",
+    "precision_10": "precision at 10 % D",
+    "recall_10": "recall at 10 % D",
+}
+
+
+def described(job: EvaluationJob, frozen: EvaluationSet, measured: Measurement) -> dict[str, Any]:
+    """What was measured, and on what: the dictionary of the JSON line.
+
+    ``figures`` are those of ``Measurement.figures``; ``intervals`` are ``[low, high]`` of 95 % of the draws.
+    """
+    from attentionvote.registry.measurement import intervals
+    from attentionvote.tracking import provenance
+
+    hardware = provenance.hardware()
+    sure = intervals(measured.resampled(job.part))
+    return {
+        "stage": "evaluate",
+        "object": job.part.name,
+        "bundle": measured.bundle,
+        "run_id": job.bundle.card.run_id,
+        "signed_by": job.signer,
+        "evaluation_set": frozen.digest,
+        "scenes": len(frozen),
+        "working_point": measured.working_point,
+        "figures": {name: round(value, 6) for name, value in measured.figures(job.part).items()},
+        "intervals": {name: [round(i.low, 6), round(i.high, 6)] for name, i in sure.items()},
+        "threads": job.cfg.evaluation.threads,
+        "machine": f"{hardware['cpu']}, {hardware['cores']} cores",
+    }
+
+
+def show(result: Mapping[str, Any]) -> None:
+    """A table on stderr."""
+    from rich.console import Console
+    from rich.table import Table
+
+    figures, sure = result["figures"], result["intervals"]
+    head = f"{result['object']}, bundle {result['bundle'][:12]}, {result['scenes']} scenes"
+    table = Table(title=head, title_justify="left", box=None, pad_edge=False)
+    for name in ("figure", "value", "95 % interval"):
+        table.add_column(name, justify="left" if name == "figure" else "right")
+    for name, title in _TITLES.items():
+        table.add_row(title, f"{figures[name]:.4f}", "{:.3f} to {:.3f}".format(*sure[name]))
+    for name, value in figures.items():
+        if name.startswith("recall_visible_"):
+            low, high = name.split("_")[-2:]
+            table.add_row(f"recall, {low}-{high} % visible", f"{value:.4f}")
+    for name, title, unit in (("center_error_mm", "centre, median", "mm"), ("rotation_error_deg", "turn, median", "°")):
+        if name in figures:
+            table.add_row(title, f"{figures[name]:.2f} {unit}")
+    table.add_row("an estimate, p50 / p95", "{latency_p50_ms:.0f} / {latency_p95_ms:.0f} ms".format(**figures))
+    Console(stderr=True).print(table)
+
+
+def record(store: str | None, run_id: str, result: Mapping[str, Any], text: str) -> None:
+    """Write the figures into the training's run; a store that does not have it costs a warning, not the figures."""
+    from attentionvote.tracking.finished_run import add_to_run
+
+    metrics = {f"evaluation/{name}": value for name, value in result["figures"].items()}
+    for name, (low, high) in result["intervals"].items():
+        metrics |= {f"evaluation/{name}_low": low, f"evaluation/{name}_high": high}
+    tags = {"evaluation.bundle": result["bundle"], "evaluation.set": result["evaluation_set"]}
+    name = f"evaluation/{result['bundle'][:12]}-{result['evaluation_set'][:12]}.json"
+    try:
+        if not run_id:
+            raise ValueError("the model's card names no run")
+        add_to_run(store, run_id, metrics, tags, {name: text})
+    except (ValueError, ConnectionError) as error:
+        log.warning("the figures are not in the training's run: %s", error)

@@ -1,0 +1,66 @@
+"""The story of a part's champion: who moved it, when, from where to where, and why.
+
+make history OBJECT=connecting_rod [ARGS="last=10"]
+"""
+
+from __future__ import annotations
+
+import logging
+from time import localtime, strftime
+from typing import Any
+
+from command import command, configuring
+from omegaconf import DictConfig
+
+log = logging.getLogger("attentionvote.history")
+
+
+def run(cfg: DictConfig) -> dict[str, Any]:
+    """Read the log, show it; the same as data."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from attentionvote.registry.history import History, counting
+    from attentionvote.registry.promotion import stand
+    from attentionvote.registry.versions import Versions
+
+    with configuring():
+        versions = Versions(cfg.tracking.store, cfg.object.name)
+        history = History(versions)
+        standing = stand(versions, history)
+        events = history.events()
+    counted = {event.number for event in counting(events)}
+    table = Table(title=versions.name, title_justify="left", box=None, pad_edge=False)
+    for name in ("when", "decision", "version", "before", "who", "why"):
+        table.add_column(name, overflow="fold")
+    rows = []
+    for event in events[-cfg.last :]:
+        void = event.moves and event.number not in counted
+        kind = f"{event.kind}, void" if void else event.kind
+        when = strftime("%Y-%m-%d %H:%M", localtime(event.when_s))
+        table.add_row(when, kind, str(event.version), str(event.before or ""), event.who, event.why)
+        rows.append(
+            {
+                "number": event.number,
+                "decision": event.kind,
+                "counts": not void,
+                "version": event.version,
+                "before": event.before,
+                "bundle": event.digest,
+                "who": event.who,
+                "when_s": event.when_s,
+                "why": event.why,
+                "facts": dict(event.facts),
+            }
+        )
+    champion = standing.champion.number if standing.champion else None
+    if events:
+        Console(stderr=True).print(table)
+    log.info("%s: %s", versions.name, f"the champion is version {champion}" if champion else "there is no champion")
+    if standing.by_hand:
+        log.warning("%s", standing.by_hand)
+    return {"stage": "history", "object": cfg.object.name, "model": versions.name, "champion": champion, "events": rows}
+
+
+if __name__ == "__main__":
+    command("history", run)

@@ -1,0 +1,164 @@
+"""What ``make promote`` does, step by step: where the champion stands, the measurement, the gates, the move."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evaluation_job import EvaluationJob
+from evaluation_report import described, show
+from omegaconf import DictConfig
+
+from attentionvote.export import Limits
+from attentionvote.inference import Bundle, BundleError, load_bundle
+from attentionvote.registry.gates import Evidence, Gate, Rules, judge
+from attentionvote.registry.history import History
+from attentionvote.registry.measurement import Measurement
+from attentionvote.registry.promotion import Standing, move, stand
+from attentionvote.registry.versions import Version, Versions
+
+log = logging.getLogger("attentionvote.promote")
+
+
+@dataclass(frozen=True)
+class PromotionJob:
+    """One candidate, and what it has to beat."""
+
+    evaluation: EvaluationJob
+    rules: Rules
+    versions: Versions
+    history: History
+    standing: Standing
+    why: str
+
+    @classmethod
+    def find(cls, cfg: DictConfig) -> PromotionJob:
+        """The candidate that a configuration names, and where the champion stands.
+
+        Raises:
+            ValueError: when there is no bundle, or the registry cannot be used.
+        """
+        evaluation = EvaluationJob.find(cfg)
+        gates = cfg.gates
+        floors = {name: value for name, value in gates.floors.items() if value is not None}
+        margins = {name: value for name, value in gates.margins.items() if value is not None}
+        rules = Rules(floors, margins, gates.latency_p95_ms, gates.scenes, Limits(**gates.parity))
+        versions = Versions(cfg.tracking.store, evaluation.part.name)
+        history = History(versions)
+        standing = stand(versions, history)
+        if standing.by_hand:
+            log.warning("%s", standing.by_hand)
+        return cls(evaluation, rules, versions, history, standing, cfg.why)
+
+    def already(self) -> dict[str, Any] | None:
+        """The answer when the candidate is the champion; None otherwise."""
+        champion, bundle = self.standing.champion, self.evaluation.bundle
+        if champion is None or champion.digest != bundle.digest:
+            return None
+        log.info("%s: bundle %s is the champion, version %d", self.name, bundle.digest[:12], champion.number)
+        return self._answer(champion, promoted=False)
+
+    @property
+    def name(self) -> str:
+        """Of the part."""
+        return self.evaluation.part.name
+
+    def run(self) -> dict[str, Any]:
+        """Measure, judge, register, move.
+
+        Raises:
+            ValueError: when a gate fails, or somebody else moved the champion meanwhile.
+        """
+        frozen = self.evaluation.evaluation_set()
+        with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
+            champion = self._champion(Path(folder))
+            bundles = [self.evaluation.bundle, *([champion] if champion else [])]
+            measured = self.evaluation.measure(bundles, frozen)
+        report = described(self.evaluation, frozen, measured[0])
+        show(report)
+        evidence = [self._evidence(one) for one in measured]
+        origin = self.versions.origin(self.evaluation.bundle.card.run_id, self.evaluation.signer)
+        gates = judge(
+            self.rules, evidence[0], evidence[1] if champion else None, self.evaluation.bundle.card, origin, len(frozen)
+        )
+        _show_gates(gates, self._against())
+        failed = [gate for gate in gates if not gate.holds]
+        facts = {f"gate.{gate.name}": str(gate) for gate in gates}
+        facts |= {"evaluation.set": frozen.digest, "machine": report["machine"]}
+        version = self.versions.register(
+            self.evaluation.bundle, facts | {"decision": "refused" if failed else "passed"}
+        )
+        before = self.standing.champion.number if self.standing.champion else None
+        if failed:
+            why = f"{len(failed)} of {len(gates)} gates failed: " + ", ".join(gate.name for gate in failed)
+            self.history.append("refuse", version.number, before, version.digest, self.standing.base, why, facts)
+            raise ValueError(
+                f"{self.name} version {version.number} stays a candidate, because {why} (first: {failed[0].demands}, "
+                f"got {failed[0].found})"
+            )
+        move(self.versions, self.history, self.standing, "promote", version, self.why, facts)
+        self.versions.tag(version, {"decision": "promoted"})
+        log.info("%s: version %d is the champion now%s", self.name, version.number, self._instead())
+        return self._answer(version, promoted=True) | {
+            "before": before,
+            "gates": {gate.name: gate.found for gate in gates},
+            "figures": report["figures"],
+            "intervals": report["intervals"],
+            "evaluation_set": frozen.digest,
+        }
+
+    def _champion(self, folder: Path) -> Bundle | None:
+        """The champion's bundle, from the registry."""
+        champion = self.standing.champion
+        if champion is None:
+            return None
+        place = self.versions.fetch(champion, folder)
+        try:
+            bundle = load_bundle(place, self.evaluation.key)
+        except BundleError as error:
+            # An older key signed it, say: it is measured as a yardstick, not trusted.
+            bundle = load_bundle(place, None)
+            log.warning("the champion, version %d, is not signed by the trusted key: %s", champion.number, error)
+        if bundle.card.part.digest != self.evaluation.part.digest:
+            log.warning("the champion, version %d, is of another form of the part and is not compared", champion.number)
+            return None
+        return bundle
+
+    def _evidence(self, measured: Measurement) -> Evidence:
+        part = self.evaluation.part
+        return Evidence(measured.figures(part), measured.resampled(part))
+
+    def _against(self) -> str:
+        champion = self.standing.champion
+        return f"against champion version {champion.number}" if champion else "no champion yet"
+
+    def _instead(self) -> str:
+        return f", instead of {self.standing.champion.number}" if self.standing.champion else ""
+
+    def _answer(self, version: Version, promoted: bool) -> dict[str, Any]:
+        return {
+            "stage": "promote",
+            "object": self.name,
+            "model": self.versions.name,
+            "version": version.number,
+            "bundle": version.digest,
+            "promoted": promoted,
+            "champion": version.number,
+        }
+
+
+def _show_gates(gates: Sequence[Gate], against: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"gates, {against}", title_justify="left", box=None, pad_edge=False)
+    for name in ("", "gate", "demands", "found"):
+        table.add_column(name, overflow="fold")
+    for gate in gates:
+        mark = "[green]holds[/]" if gate.holds else "[bold red]FAILS[/]"
+        table.add_row(mark, gate.name, gate.demands, gate.found)
+    Console(stderr=True).print(table)

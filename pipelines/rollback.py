@@ -1,0 +1,55 @@
+"""Roll a champion back: the one before it, or a former champion by its version, serves again.
+
+    make rollback OBJECT=connecting_rod [TO=3] [ARGS="why='misses parts at the wall'"]
+
+Nothing is measured, so it takes seconds; the version must still be there, whole, and signed by the trusted key.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from command import command, configuring
+from omegaconf import DictConfig
+
+log = logging.getLogger("attentionvote.rollback")
+
+
+def run(cfg: DictConfig) -> dict[str, Any]:
+    """Choose, check, move; what is champion now."""
+    from evaluation_job import trusted_key
+
+    from attentionvote.inference import load_bundle
+    from attentionvote.registry.history import History
+    from attentionvote.registry.promotion import move, stand, target
+    from attentionvote.registry.versions import Versions
+
+    with configuring():
+        key = trusted_key(cfg.trusted_key)
+        versions = Versions(cfg.tracking.store, cfg.object.name)
+        history = History(versions)
+        standing = stand(versions, history)
+        if standing.by_hand:
+            log.warning("%s", standing.by_hand)
+        version = target(versions, standing, cfg.to)
+        with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
+            load_bundle(versions.fetch(version, Path(folder)), key)
+    move(versions, history, standing, "rollback", version, cfg.why)
+    before = standing.champion.number if standing.champion else None
+    log.info("%s: version %d is the champion again, instead of %s", cfg.object.name, version.number, before or "none")
+    return {
+        "stage": "rollback",
+        "object": cfg.object.name,
+        "model": versions.name,
+        "version": version.number,
+        "bundle": version.digest,
+        "champion": version.number,
+        "before": before,
+    }
+
+
+if __name__ == "__main__":
+    command("rollback", run)

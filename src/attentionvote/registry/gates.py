@@ -1,0 +1,171 @@
+"""The gates of a promotion: what must hold before a model may move into the cells, judged one by one.
+
+Plain numbers in, sentences out: nothing here measures, reads or writes. A gate that cannot be judged does not hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from attentionvote.contract import ModelCard
+from attentionvote.evaluation import interval
+from attentionvote.evaluation.scene_result import Array
+from attentionvote.export import Limits, Parity
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a promotion demands.
+
+    Args:
+        floors: least value by figure, whatever the champion reaches.
+        margins: by how much a figure may be lower than the champion's; a larger loss must be excluded with 97.5 %
+            confidence (the lower end of the 95 % interval of the paired difference).
+        latency_p95_ms: largest 95th percentile of an estimate on the machine that promotes.
+        scenes: least size of the evaluation set.
+        parity: what the proof of the export may have measured at most.
+
+    """
+
+    floors: Mapping[str, float]
+    margins: Mapping[str, float]
+    latency_p95_ms: float
+    scenes: int
+    parity: Limits
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One gate: its name, whether it holds, what it demands and what was found."""
+
+    name: str
+    holds: bool
+    demands: str
+    found: str
+
+    def __str__(self) -> str:
+        return f"{'holds' if self.holds else 'FAILS'}: {self.demands}; {self.found}"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of one model.
+
+    Attributes:
+        figures: of ``Measurement.figures``.
+        draws: of ``Measurement.resampled``; of two models with the same weights.
+    """
+
+    figures: Mapping[str, float]
+    draws: Mapping[str, Array] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What the tracking store knows of the training that made a model.
+
+    Attributes:
+        found: whether it has the run that the card names.
+        has_config: whether the run holds its resolved configuration.
+        has_patch: whether it holds the uncommitted changes of a commit that is not clean.
+        signed_by: fingerprint of the key whose signature was verified.
+    """
+
+    found: bool
+    has_config: bool = False
+    has_patch: bool = False
+    signed_by: str = ""
+
+
+def judge(
+    rules: Rules, candidate: Evidence, champion: Evidence | None, card: ModelCard, origin: Origin, scenes: int
+) -> list[Gate]:
+    """Every gate, in the order in which people ask.
+
+    Args:
+        rules: what is demanded.
+        candidate: measured on the evaluation set.
+        champion: measured on the same scenes in the same process; None when there is none yet.
+        card: of the candidate.
+        origin: of the candidate.
+        scenes: in the evaluation set.
+    """
+    gates = [Gate("scenes", scenes >= rules.scenes, f"at least {rules.scenes} scenes", f"measured on {scenes}")]
+    gates += _floors(rules.floors, candidate)
+    if champion is not None:
+        gates += _not_worse(rules.margins, candidate, champion)
+    return [*gates, _latency(rules.latency_p95_ms, candidate), _parity(card, rules.parity), *_provenance(card, origin)]
+
+
+def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
+    for name, floor in floors.items():
+        value = candidate.figures.get(name)
+        demands = f"{name} at least {floor:g}"
+        if value is None:
+            yield Gate(f"floor {name}", False, demands, "it was not measured")
+            continue
+        found = f"{value:.4f}"
+        if name in candidate.draws:
+            sure = interval(candidate.draws[name])
+            found += f" ({sure.low:.3f} to {sure.high:.3f})"
+        yield Gate(f"floor {name}", value >= floor, demands, found)
+
+
+def _not_worse(margins: Mapping[str, float], candidate: Evidence, champion: Evidence) -> Iterator[Gate]:
+    for name, margin in margins.items():
+        demands = f"{name} at most {margin:g} below the champion's"
+        if name not in candidate.draws or name not in champion.draws:
+            yield Gate(f"champion {name}", False, demands, "it was not measured for both")
+            continue
+        difference = candidate.figures[name] - champion.figures[name]
+        sure = interval(candidate.draws[name] - champion.draws[name])
+        found = f"{champion.figures[name]:.4f} {difference:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
+        yield Gate(f"champion {name}", sure.low >= -margin, demands, found)
+
+
+def _latency(budget_ms: float, candidate: Evidence) -> Gate:
+    p50, p95 = (candidate.figures[f"latency_{name}_ms"] for name in ("p50", "p95"))
+    return Gate("latency", p95 <= budget_ms, f"p95 at most {budget_ms:g} ms", f"{p95:.0f} ms (p50 {p50:.0f})")
+
+
+def _parity(card: ModelCard, limits: Limits) -> Gate:
+    demands = "a proof of parity within the limits"
+    paths: Any = card.parity.get("paths")
+    if not isinstance(paths, Mapping) or not paths:
+        return Gate("parity", False, demands, "the card holds no proof: export the model again")
+    found = []
+    for path, content in paths.items():
+        try:
+            parity = Parity.from_dict(content)
+        except ValueError as error:
+            return Gate("parity", False, demands, f"{path}: {error}")
+        broken = parity.violations(limits)
+        if broken:
+            return Gate("parity", False, demands, f"{path}: {broken[0]}")
+        found.append(f"{path} {parity.translation_mm:.4f} mm, {parity.rotation_degrees:.4f} degrees")
+    return Gate("parity", True, demands, "; ".join(found))
+
+
+def _provenance(card: ModelCard, origin: Origin) -> Iterator[Gate]:
+    commit, _, dirty = card.commit.partition("+")
+    known = len(commit) == 40 and set(commit) <= set("0123456789abcdef")
+    found = commit[:12] if known else f"got {card.commit or 'none'}"
+    if known and dirty:
+        found += f" with changes that are {'recorded' if origin.has_patch else 'not recorded'}"
+    yield Gate(
+        "commit", known and (not dirty or origin.has_patch), "a commit, clean or with its changes recorded", found
+    )
+    missing = [split for split in ("train", "val", "test") if not card.data.get(split)]
+    digests = ", ".join(f"{split} {digest[:8]}" for split, digest in card.data.items())
+    yield Gate("data", not missing, "digests of all scene sets", digests if not missing else f"no {missing[0]} digest")
+    where = f"run {card.run_id[:8]}" if card.run_id else "the card names no run"
+    known_config = origin.found and origin.has_config
+    problem = "" if known_config else (" has no config.yaml" if origin.found else " is not in the store")
+    yield Gate("config", known_config, "the run's resolved configuration", where + problem * bool(card.run_id))
+    lacking = [name for name in ("attentionvote", "torch", "onnx", "onnxruntime") if name not in card.versions]
+    versions = ", ".join(f"{name} {card.versions[name]}" for name in ("torch", "onnxruntime") if name in card.versions)
+    yield Gate("versions", not lacking, "versions of what made it", f"no {lacking[0]}" if lacking else versions)
+    signed = f"key {origin.signed_by}" if origin.signed_by else "no signature was verified"
+    yield Gate("signature", bool(origin.signed_by), "the signature of the trusted key", signed)

@@ -1,0 +1,213 @@
+"""The registered versions of one part's model: ``attentionvote-<part>`` in MLflow's registry.
+
+A version's artefacts are a bundle's folder, nothing else: a cell fetches the files that the manifest names. The tag
+``bundle.digest`` says which bundle it is. Aliases: ``candidate`` is the version registered last, ``champion`` the one
+that cells follow.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from attentionvote.inference import Bundle, BundleError, load_bundle
+from attentionvote.registry.gates import Origin
+from attentionvote.tracking.store import connect, experiment_id, resolve_store
+
+if TYPE_CHECKING:
+    from mlflow.entities.model_registry import ModelVersion
+
+PREFIX = "attentionvote-"
+CHAMPION, CANDIDATE = "champion", "candidate"
+DIGEST_TAG = "bundle.digest"
+
+
+@dataclass(frozen=True)
+class Version:
+    """One registered version.
+
+    Attributes:
+        number: of the version.
+        digest: of its bundle; empty when the version was not registered by us.
+        run_id: of the training's run; empty when unknown.
+        created_s: when it was registered, seconds since 1970.
+        tags: all of them.
+    """
+
+    number: int
+    digest: str
+    run_id: str
+    created_s: float
+    tags: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+
+class Versions:
+    """The versions of a part's model in one store.
+
+    Args:
+        store: see :func:`attentionvote.tracking.store.resolve_store`.
+        part: name of the part.
+
+    Raises:
+        ValueError: the store's URI is impossible or it cannot be used.
+        ConnectionError: the server does not answer.
+    """
+
+    def __init__(self, store: str | None, part: str) -> None:
+        self.uri = resolve_store(store)
+        self.part = part
+        self.name = PREFIX + part
+        self.client = connect(self.uri)
+
+    def all(self) -> list[Version]:
+        """Every version that exists, oldest first; empty when nothing was ever registered."""
+        found, token = [], None
+        while True:
+            page = self.client.search_model_versions(f"name='{self.name}'", max_results=200, page_token=token)
+            found += [_version(row) for row in page]
+            token = page.token
+            if not token:
+                return sorted(found, key=lambda version: version.number)
+
+    def champion(self) -> Version | None:
+        """The version that cells follow; None before the first promotion, or when it was deleted."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            return _version(self.client.get_model_version_by_alias(self.name, CHAMPION))
+        except MlflowException as error:
+            if error.error_code in ("INVALID_PARAMETER_VALUE", "RESOURCE_DOES_NOT_EXIST"):
+                return None
+            raise
+
+    def of_bundle(self, digest: str) -> Version | None:
+        """The newest version that is this bundle; None when it was never registered."""
+        return next((version for version in reversed(self.all()) if version.digest == digest), None)
+
+    def register(self, bundle: Bundle, tags: Mapping[str, str]) -> Version:
+        """Upload a bundle, read it back, and make it a version; the same bundle is registered once.
+
+        Raises:
+            OSError: when what the store gives back is not what it got.
+        """
+        known = self.of_bundle(bundle.digest)
+        if known is not None:
+            self.tag(known, tags)
+            return known
+        run = self._run(bundle.card.run_id)
+        experiment = run.info.experiment_id if run else experiment_id(self.client, self.uri, self.part)
+        run_id = run.info.run_id if run else None
+        facts = {DIGEST_TAG: bundle.digest, **tags}
+        with self._global_store():
+            model = self.client.create_logged_model(
+                experiment,
+                name=f"{self.part}-{bundle.digest[:12]}",
+                source_run_id=run_id,
+                tags={DIGEST_TAG: bundle.digest},
+                model_type="attentionvote bundle",
+            )
+            self.client.log_model_artifacts(model.model_id, str(bundle.path))
+            with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
+                self._check(bundle.digest, model.artifact_location, Path(folder))
+            self.client.finalize_logged_model(model.model_id, "READY")
+            self._create_registered_model()
+            row = self.client.create_model_version(
+                self.name, f"models:/{model.model_id}", run_id=run_id, tags=facts, model_id=model.model_id
+            )
+            self.client.set_registered_model_alias(self.name, CANDIDATE, row.version)
+        return _version(row)
+
+    def fetch(self, version: Version, folder: Path) -> Path:
+        """Download a version's bundle into a folder and return where it lies; nothing of it is trusted yet.
+
+        Raises:
+            ValueError: when its artefacts are gone.
+        """
+        return self._download(self.client.get_model_version_download_uri(self.name, str(version.number)), folder)
+
+    def origin(self, run_id: str, signed_by: str) -> Origin:
+        """What the store knows of the training that made a model.
+
+        Args:
+            run_id: as the model's card names it.
+            signed_by: fingerprint of the key whose signature of the bundle was verified.
+        """
+        if self._run(run_id) is None:
+            return Origin(False, signed_by=signed_by)
+        files = [file.path for file in self.client.list_artifacts(run_id)]
+        resumed = [name for name in files if name.startswith("resume_")]
+        files += [file.path for folder in resumed for file in self.client.list_artifacts(run_id, folder)]
+        has_patch = any(name.rpartition("/")[2] == "uncommitted.patch" for name in files)
+        return Origin(True, "config.yaml" in files, has_patch, signed_by)
+
+    def set_champion(self, version: Version) -> None:
+        """Move the alias; cells follow within their polling time."""
+        self.client.set_registered_model_alias(self.name, CHAMPION, str(version.number))
+
+    def tag(self, version: Version, tags: Mapping[str, str]) -> None:
+        """Set tags of a version."""
+        for name, value in tags.items():
+            self.client.set_model_version_tag(self.name, str(version.number), name, value)
+
+    def _create_registered_model(self) -> None:
+        from mlflow.exceptions import MlflowException
+
+        about = f"6D pose models of {self.part}; moved by `make promote` and `make rollback`, see {self.name}-history"
+        try:
+            self.client.create_registered_model(self.name, tags={"part": self.part}, description=about)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+
+    def _run(self, run_id: str) -> Any:
+        """The run of an id, or None when the store does not have it."""
+        from mlflow.exceptions import MlflowException
+
+        if not run_id:
+            return None
+        try:
+            return self.client.get_run(run_id)
+        except MlflowException:
+            return None
+
+    def _check(self, digest: str, location: str, folder: Path) -> None:
+        """What was stored must be the bundle, bit by bit: a proxy, a full disk or another version may interfere."""
+        try:
+            stored = load_bundle(self._download(location, folder), None)
+        except BundleError as error:
+            raise OSError(f"the registry must give back the bundle it got, but {error}") from error
+        if stored.digest != digest:
+            raise OSError(f"the registry must give back bundle {digest[:12]}, but it gave {stored.digest[:12]}")
+
+    def _download(self, location: str, folder: Path) -> Path:
+        from mlflow.artifacts import download_artifacts
+        from mlflow.exceptions import MlflowException
+
+        try:
+            return Path(download_artifacts(artifact_uri=location, dst_path=str(folder), tracking_uri=self.uri))
+        except (MlflowException, OSError) as error:
+            reason = str(error).strip().split("\n")[0]
+            raise ValueError(
+                f"the artefacts of {self.name} must be in the store, but they are not: {reason}"
+            ) from error
+
+    @contextlib.contextmanager
+    def _global_store(self) -> Iterator[None]:
+        """MLflow's SQL registry looks logged models up in the global tracking store, whatever its client says."""
+        import mlflow
+
+        before = mlflow.get_tracking_uri()
+        mlflow.set_tracking_uri(self.uri)
+        try:
+            yield
+        finally:
+            mlflow.set_tracking_uri(before)
+
+
+def _version(row: ModelVersion) -> Version:
+    tags = dict(row.tags)
+    return Version(int(row.version), tags.get(DIGEST_TAG, ""), row.run_id or "", row.creation_timestamp / 1000, tags)
