@@ -1,0 +1,90 @@
+"""Versions in a real store: what is registered comes back bit by bit, once, and what it came from is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from attentionvote import tracking
+from attentionvote.inference import load_bundle
+from attentionvote.registry.gates import Origin
+
+
+def test_a_bundle_is_registered_once_and_comes_back_whole(versions, make_model, trusted_key, tmp_path):
+    assert (versions.all(), versions.champion(), versions.of_bundle("x")) == ([], None, None)
+    bundle = make_model()
+    version = versions.register(bundle, {"decision": "passed"})
+    assert (version.number, version.digest, version.tags["decision"]) == (1, bundle.digest, "passed")
+    again = versions.register(bundle, {"decision": "refused"})
+    assert again.number == 1
+    assert [v.tags["decision"] for v in versions.all()] == ["refused"]
+    place = versions.fetch(version, tmp_path / "fetched")
+    assert load_bundle(place, trusted_key).digest == bundle.digest
+
+
+def test_candidate_is_the_newest_and_champion_the_chosen(versions, make_model):
+    first, second = (versions.register(make_model(t), {}) for t in (0.5, 0.6))
+    assert versions.champion() is None
+    versions.set_champion(first)
+    assert versions.champion() == first
+    client = versions.client
+    assert int(client.get_model_version_by_alias(versions.name, "candidate").version) == second.number
+
+
+def test_a_deleted_champion_is_no_champion(versions, make_model):
+    version = versions.register(make_model(), {})
+    versions.set_champion(version)
+    versions.client.delete_model_version(versions.name, str(version.number))
+    assert versions.champion() is None
+
+
+def test_artefacts_that_are_gone_are_said(versions, make_model, tmp_path):
+    version = versions.register(make_model(), {})
+    (model,) = (
+        (tmp_path / "outputs").rglob("model.onnx") if _is_database(versions) else tmp_path.rglob("m-*/**/model.onnx")
+    )
+    for path in sorted(model.parent.rglob("*"), reverse=True):
+        path.unlink() if path.is_file() else path.rmdir()
+    model.parent.rmdir()
+    with pytest.raises(ValueError, match="the artefacts of attentionvote-bracket must be in the store"):
+        versions.fetch(version, tmp_path / "fetched")
+
+
+def _is_database(versions) -> bool:
+    return not versions.uri.startswith("sqlite")
+
+
+def test_what_the_store_spoils_is_not_registered(versions, make_model, monkeypatch):
+    bundle = make_model()
+    store, client = versions.client.log_model_artifacts, versions.client
+
+    def spoiling(model_id: str, folder: str) -> None:
+        store(model_id, folder)
+        location = client.get_logged_model(model_id).artifact_location
+        card = Path(location.removeprefix("file://")) / "card.json"
+        card.write_text(card.read_text() + " ")
+
+    monkeypatch.setattr(client, "log_model_artifacts", spoiling)
+    with pytest.raises(OSError, match=r"the registry must give back the bundle it got, but .*card\.json"):
+        versions.register(bundle, {})
+    assert versions.all() == []
+
+
+def test_the_origin_is_what_the_training_left_in_the_store(versions, tmp_path):
+    assert versions.origin("", "key") == Origin(False, signed_by="key")
+    assert versions.origin("feed" * 8, "key") == Origin(False, signed_by="key")
+    with tracking.start_run(
+        versions.uri, "bracket", config_yaml="a: 1\n", repository=tmp_path, system_interval_s=0
+    ) as run:
+        pass
+    assert versions.origin(run.id, "key") == Origin(True, has_config=True, has_patch=False, signed_by="key")
+    versions.client.log_text(run.id, "diff", "resume_1/uncommitted.patch")
+    assert versions.origin(run.id, "") == Origin(True, has_config=True, has_patch=True)
+
+
+def test_a_version_belongs_to_the_run_of_its_training(versions, make_bundle, trusted_key, tmp_path):
+    with tracking.start_run(versions.uri, "elsewhere", repository=tmp_path, system_interval_s=0) as run:
+        pass
+    bundle = load_bundle(make_bundle("of_a_run", card={"run_id": run.id}), trusted_key)
+    assert versions.register(bundle, {}).run_id == run.id
