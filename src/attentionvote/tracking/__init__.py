@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from attentionvote.tracking.run import Run, start_run
+from attentionvote.tracking.run import Run
+from attentionvote.tracking.run_opening import start_run
 
 if TYPE_CHECKING:
     from attentionvote.tracking.lightning_logger import RunLogger

@@ -1,0 +1,101 @@
+"""Opening a run, new or again, with a record of where it comes from."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from attentionvote.tracking import provenance
+from attentionvote.tracking.run import Run, status_of
+from attentionvote.tracking.store import connect, experiment_id, resolve_store
+
+
+def start_run(
+    store: str | None = None,
+    experiment: str = "default",
+    name: str | None = None,
+    run_id: str | None = None,
+    params: Mapping[str, object] | None = None,
+    config_yaml: str = "",
+    tags: Mapping[str, object] | None = None,
+    datasets: Mapping[str, str] | None = None,
+    repository: Path | None = None,
+    system_interval_s: float = 15.0,
+) -> Run:
+    """Open a new run, or the run of ``run_id`` again.
+
+    Args:
+        store: see :func:`attentionvote.tracking.store.resolve_store`.
+        experiment: created when new. A resumed run stays in its own.
+        name: shown in the UI.
+        run_id: of the run to resume, whatever ended it (kill -9 included); None for a new one.
+        params: a short set that identifies the run; immutable, see :meth:`Run.log_params`.
+        config_yaml: the full resolved configuration, stored as ``config.yaml``.
+        tags: free labels.
+        datasets: full digest by use (``{"train": sha256}``).
+        repository: folder whose git state is recorded; the working directory by default.
+        system_interval_s: seconds between samples of the machine's load, 0 for none.
+
+    Raises:
+        ValueError: the store's URI is impossible, or it has no run ``run_id``.
+        ConnectionError: the tracking server does not answer.
+    """
+    uri = resolve_store(store)
+    client = connect(uri)
+    from mlflow.exceptions import MlflowException
+
+    if run_id is None:
+        created = client.create_run(experiment_id(client, uri, experiment), run_name=name, tags={"sessions": "0"})
+        run_id = created.info.run_id
+        session = 0
+    else:
+        try:
+            found = client.get_run(run_id)
+        except MlflowException as error:
+            raise ValueError(f"run_id must name a run in {uri}, got {run_id!r}, which it does not have") from error
+        if found.info.lifecycle_stage == "deleted":
+            client.restore_run(run_id)
+        client.update_run(run_id, status="RUNNING")  # FAILED or KILLED before, or left RUNNING by a kill -9
+        session = int(found.data.tags.get("sessions", "0")) + 1
+    run = Run(client, uri, run_id, system_interval_s)
+    try:
+        _record_origin(run, session, config_yaml, repository or Path.cwd())
+        run.log_tags({**(tags or {}), "sessions": session})
+        run.log_params(params or {})
+        if datasets:
+            run.log_datasets(datasets)
+    except BaseException as error:
+        run.close(status_of(error))
+        raise
+    return run
+
+
+def _record_origin(run: Run, session: int, config_yaml: str, repository: Path) -> None:
+    git = provenance.git_state(repository)
+    hardware, versions = provenance.hardware(), provenance.package_versions()
+    command = provenance.command_line()
+    run.log_tags(
+        {
+            "git.commit": git.commit,
+            "git.dirty": str(git.is_dirty).lower(),
+            "mlflow.source.git.commit": git.commit,
+            "mlflow.source.name": sys.argv[0],
+            "mlflow.source.type": "LOCAL",
+            **{f"hardware.{key}": hardware[key] for key in ("cpu", "cores", "memory_gib", "gpu")},
+            **{f"version.{key}": value for key, value in versions.items()},
+        }
+    )
+    folder = f"resume_{session}/" if session else ""  # what the run began with is never overwritten
+    if config_yaml:
+        run.log_text(f"{folder}config.yaml", config_yaml)
+    environment = {"command": command, "hardware": hardware, "versions": versions, "git_commit": git.commit}
+    run.log_text(f"{folder}environment.json", json.dumps(environment, indent=2) + "\n")
+    if git.is_dirty:
+        run.log_text(f"{folder}uncommitted.patch", git.patch)
+        run.log_text(f"{folder}uncommitted_status.txt", git.status)
+    with contextlib.suppress(KeyError):
+        run.log_tags({"mlflow.user": os.environ["USER"]})
