@@ -1,0 +1,176 @@
+"""The verbs promote, rollback and history on complete bundles: what a user sees, and what stays afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import history
+import promote
+import pytest
+import rollback
+from configuration import ConfigurationError, compose
+
+from attentionvote import tracking
+from attentionvote.registry.versions import Versions
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def store(tmp_path) -> str:
+    return f"sqlite:///{tmp_path}/mlflow.db"
+
+
+@pytest.fixture
+def model(export_brick, store, tmp_path):
+    """Exports a model that a training in the store made."""
+
+    def make(name: str, **changes):
+        with tracking.start_run(store, "brick", config_yaml="a: 1", repository=tmp_path, system_interval_s=0) as run:
+            pass
+        return export_brick(name, run.id, **changes)
+
+    return make
+
+
+@pytest.fixture
+def verb(store, few_scenes, easy_gates):
+    """Runs one of the verbs."""
+
+    def call(name: str, *words: str):
+        module = {"promote": promote, "rollback": rollback, "history": history}[name]
+        settings = [*few_scenes, *easy_gates] if name == "promote" else ["object=brick"]
+        return module.run(compose(name, [*settings, f"tracking.store={store}", *words]))
+
+    return call
+
+
+def test_from_promotion_to_rollback(verb, model, store, capsys):
+    first = model("one")
+    done = verb("promote", "why='the first one'")
+    assert (done["version"], done["promoted"], done["before"]) == (1, True, None)
+    assert done["bundle"] == first.digest
+    second = model("two")
+    done = verb("promote")
+    assert (done["version"], done["before"], done["champion"]) == (2, 1, 2)
+    assert done["gates"]["champion ap_10"].startswith(f"{done['figures']['ap_10']:.4f} +0.0000")
+    table = " ".join(capsys.readouterr().err.split())
+    assert "gates, against champion version 1" in table
+    versions = Versions(store, "brick")
+    champion = versions.champion()
+    assert champion is not None
+    assert (champion.digest, champion.tags["decision"]) == (second.digest, "promoted")
+    assert champion.tags["gate.parity"].startswith("holds: a proof of parity")
+    assert champion.tags["evaluation.set"] == done["evaluation_set"]
+    assert verb("promote")["promoted"] is False  # it is the champion already: nothing is measured
+    back = verb("rollback", "why='misses parts'")
+    assert (back["version"], back["before"], back["bundle"]) == (1, 2, first.digest)
+    told = verb("history")
+    assert told["champion"] == 1
+    assert [(e["decision"], e["version"], e["before"], e["why"]) for e in told["events"]] == [
+        ("promote", 1, None, "the first one"), ("promote", 2, 1, "all gates hold"), ("rollback", 1, 2, "misses parts"),
+    ]  # fmt: skip
+    assert [e["version"] for e in verb("history", "last=1")["events"]] == [1]
+    assert verb("rollback", "to=2")["version"] == 2
+    versions.client.delete_model_version(versions.name, "1")
+    assert len(verb("history")["events"]) == 4  # the story survives the version
+
+
+def test_a_model_that_fails_a_gate_stays_a_candidate_and_is_told(verb, model, store):
+    model("one")
+    verb("promote")
+    bad = model("two", graph={"offsets": [[1.0, 0, 0]] * 4})
+    said = r"brick version 2 stays a candidate, because 1 of 16 gates failed: floor ap_10 \(first: ap_10 at least 0.9"
+    with pytest.raises(ValueError, match=said):
+        verb("promote", "gates.floors.ap_10=0.9")
+    versions = Versions(store, "brick")
+    assert versions.champion().number == 1
+    candidate = versions.of_bundle(bad.digest)
+    assert candidate.tags["decision"] == "refused"
+    assert candidate.tags["gate.floor ap_10"].startswith("FAILS: ap_10 at least 0.9; 0.0")
+    event = verb("history")["events"][-1]
+    assert (event["decision"], event["version"], event["before"]) == ("refuse", 2, 1)
+    assert event["facts"]["gate.scenes"] == "holds: at least 2 scenes; measured on 2"
+    # The same bundle may pass later, as the same version.
+    assert verb("promote")["version"] == 2
+
+
+def test_gates_can_be_switched_off_one_by_one(verb, model):
+    model("one")
+    verb("promote")
+    model("two")
+    done = verb("promote", "gates.margins.ap_2=null", "gates.floors.recall_10=null")
+    assert "champion ap_2" not in done["gates"]
+    assert "champion ap_5" in done["gates"]
+    assert "floor recall_10" not in done["gates"]
+
+
+def test_missing_provenance_is_refused(verb, export_brick):
+    export_brick("orphan")
+    with pytest.raises(ValueError, match="stays a candidate, because 1 of 11 gates failed: config"):
+        verb("promote")
+
+
+def test_what_cannot_be_done_is_said_before_any_work(verb, model, tmp_path):
+    with pytest.raises(ConfigurationError, match="must hold a bundle, got none: run `make export OBJECT=brick`"):
+        verb("promote")
+    with pytest.raises(ConfigurationError, match="needs an earlier champion that still exists, got none"):
+        verb("rollback")
+    assert verb("history")["events"] == []
+    with pytest.raises(
+        ConfigurationError, match=r"gates\.floors\.ap_10 must be a number at least 0 and at most 1; got 2"
+    ):
+        verb("promote", "gates.floors.ap_10=2")
+    model("one")
+    (tmp_path / "data").write_text("a file")
+    with pytest.raises(OSError, match="data"):
+        verb("promote")
+
+
+def test_a_rollback_to_a_version_whose_artefacts_are_gone_moves_nothing(verb, model, store, tmp_path):
+    model("one")
+    verb("promote")
+    model("two")
+    verb("promote")
+    (gone,) = (p for p in (tmp_path / "mlartifacts" / "models").rglob("card.json") if '"one"' in p.read_text())
+    gone.unlink()
+    with pytest.raises(ConfigurationError, match=r"card\.json is missing"):
+        verb("rollback")
+    assert Versions(store, "brick").champion().number == 2
+
+
+@pytest.mark.slow
+def test_of_two_processes_that_promote_at_once_exactly_one_wins(verb, model, store, few_scenes, easy_gates, tmp_path):
+    model("zero")
+    verb("promote")
+    digests = [model(name).digest for name in ("one", "two")]
+    command = [
+        sys.executable,
+        str(ROOT / "pipelines" / "promote.py"),
+        *few_scenes,
+        *easy_gates,
+        f"tracking.store={store}",
+    ]
+    # Both measure for seconds against the same champion: whoever comes second must lose.
+    slow = ["evaluation.density=40000", "simulation.drop_counts=[2,3,4,5,6,7,8,9]", "gates.scenes=1"]
+    both = [
+        subprocess.Popen(
+            [*command, *slow, f"bundle='{digest[:12]}'"], cwd=tmp_path, env=dict(os.environ), text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )
+        for digest in digests
+    ]  # fmt: skip
+    ends = [process.communicate(timeout=200) for process in both]
+    codes = sorted(process.returncode for process in both)
+    assert codes == [0, 1], [end[1][-500:] for end in ends]
+    winner = next(i for i in range(2) if both[i].returncode == 0)
+    assert json.loads(ends[winner][0])["bundle"] == digests[winner]
+    assert "came first: run the same command again to decide against the new champion" in ends[1 - winner][1]
+    assert ends[1 - winner][0] == ""
+    assert Versions(store, "brick").champion().digest == digests[winner]
+    events = verb("history")["events"]
+    assert [(e["decision"], e["counts"]) for e in events[1:]] == [("promote", True), ("promote", False)]
