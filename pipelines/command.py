@@ -30,7 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 
 __all__ = ["ConfigurationError", "command", "configuring"]
 
-Run = Callable[[DictConfig], dict[str, Any]]
+Run = Callable[[DictConfig], dict[str, Any] | None]
 Defaults = Callable[[list[str]], list[str]]
 LOGS = Path("outputs/logs")
 # Threads that wait for work sleep: spinning ones make a shared machine several times slower (torch reads this once).
@@ -42,7 +42,7 @@ def command(verb: str, run: Run, *, defaults: Defaults | None = None, conf: Path
 
     Args:
         verb: stem of the script and of its primary configuration file.
-        run: does the work; its dictionary becomes the JSON line.
+        run: does the work; its dictionary becomes the JSON line (None: another process of the same work prints it).
         defaults: given the user's words, further overrides that stand for the machine's default
             (they come first, so the user's words win).
         conf: folder of the configuration files.
@@ -106,7 +106,8 @@ def _print_result(run: Run, cfg: DictConfig) -> None:
     finally:
         os.dup2(stdout, 1)
         os.close(stdout)
-    print(json.dumps(result, default=_jsonable), flush=True)
+    if result is not None:
+        print(json.dumps(result, default=_jsonable), flush=True)
 
 
 def _jsonable(value: Any) -> Any:

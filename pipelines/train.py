@@ -1,43 +1,59 @@
 """Train a part's network: generate what is missing, train, validate, test, track.
 
-    make train OBJECT=connecting_rod [ARGS="trainer.max_epochs=20 seed=1"]
+    make train OBJECT=connecting_rod [PROCESSES=8] [ARGS="trainer.max_epochs=20 seed=1"]
 
 The default preset follows the hardware: compact on a CPU, gpu where there is a GPU; ARGS="experiment=paper" is the
 paper's. Interrupted, also by kill -9, the same command goes on where it was, in the same MLflow run; a training that
-is complete is not repeated without force=true.
+is complete is not repeated without force=true. PROCESSES share every batch, one a GPU (docs/several-processes.md).
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import sys
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from command import command, configuring
 from omegaconf import DictConfig
+from training_processes import Place, be_silent, failing_at_once, first_speaks, refuse_grid
 
 log = logging.getLogger("attentionvote.train")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
-    """Generate, train, test; the test figures and where the model is."""
+def run(cfg: DictConfig) -> dict[str, Any] | None:
+    """Generate, train, test; the test figures and where the model is, None in all processes but the first."""
+    place = Place.of(os.environ)
+    with first_speaks(place):
+        return _run(cfg, place)
+
+
+def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
     from training_job import find_training
 
     with configuring(f"object {cfg.object.name}"):
         job = find_training(cfg)
-    with job.locked():
-        result = job.result
-        if result is not None and cfg.resume != "never" and not cfg.force:
-            commit = str(result.get("commit", "unknown"))[:12]
-            log.info("this training is complete, made at commit %s (force=true repeats it): %s", commit, job.directory)
+    with configuring():
+        place.check(cfg.trainer.batch_size, {s: spec.cycles * len(spec.drop_counts) for s, spec in job.specs.items()})
+    # The lock comes before the meeting: a training that another process is at ends at once.
+    with job.locked() if place.rank == 0 else nullcontext(), place.joined(cfg.trainer.accelerator) as first_does:
+        result = job.result if place.rank == 0 else None
+        complete = result is not None and cfg.resume != "never" and not cfg.force
+        if first_does("complete", lambda: complete):
+            if result is not None:
+                commit = str(result.get("commit", "unknown"))[:12]
+                log.info(
+                    "this training is complete, made at commit %s (force=true repeats it): %s", commit, job.directory
+                )
             return result
         from training_run import TrainingRun
 
         with configuring():
-            training = TrainingRun(cfg, job)
-        if cfg.resume == "never" or (cfg.force and result is not None):
+            training = TrainingRun(cfg, job, place, first_does)
+        if place.rank == 0 and (cfg.resume == "never" or (cfg.force and result is not None)):
             job.forget()
         return training.run()
 
@@ -47,6 +63,10 @@ def preset_of_hardware(words: list[str]) -> list[str]:
 
     Told without importing torch: an NVIDIA driver is loaded, not hidden from us, and torch is no CPU build.
     """
+    place = Place.of(os.environ)
+    refuse_grid(place, sys.argv)
+    if place.local_rank:
+        be_silent()  # what is wrong with the words is said once a machine
     if any(word.lstrip("+~").startswith("experiment") for word in words):
         return []
     preset, reason = "compact", "no GPU was found"
@@ -56,9 +76,11 @@ def preset_of_hardware(words: list[str]) -> list[str]:
             preset, reason = "compact", "CUDA_VISIBLE_DEVICES hides the GPU"
         elif version("torch").endswith("+cpu"):
             preset, reason = "compact", "torch is a CPU build"
-    log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
+    if place.rank == 0:
+        log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
     return [f"experiment={preset}"]
 
 
 if __name__ == "__main__":
-    command("train", run, defaults=preset_of_hardware)
+    with failing_at_once(os.environ):
+        command("train", run, defaults=preset_of_hardware)

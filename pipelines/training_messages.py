@@ -15,6 +15,9 @@ _CHATTER = (
     ".*treespec, LeafSpec.*",
     ".*LeafSpec.*is deprecated.*",
     ".*The number of training batches .* is smaller than the logging interval.*",
+    # Of several processes: what is logged is the same in all of them already, and the warm-up leaves parameters unused.
+    ".*`self.log.*sync_dist=True.*",
+    ".*find_unused_parameters=True was specified.*",
     ".*`ModelCheckpoint.monitor=.*could not find the monitored key.*",
 )
 

@@ -17,21 +17,33 @@ from attentionvote.training import AttentionVoteLoss, PoseTraining
 from attentionvote.training.checkpoint import load_weights, save_trained
 from attentionvote.training.operating_point import best_threshold, confident
 from attentionvote.training.pictures import picture_inputs
+from attentionvote.training.processes import in_order
 
 log = logging.getLogger("attentionvote.train")
 _LEAST_HISTORY = 10  # logged steps from which on it can be said whether a loss fell
 
 
+def detect_everything(
+    module: PoseTraining, data: PartDataModule, weights: Path, device: torch.device
+) -> dict[str, list[SceneResult]]:
+    """What the weights of a checkpoint find in all validation and test scenes, by split.
+
+    Every process looks at its share; the first one gets all, in the order of the scenes, the others get empty lists.
+    """
+    load_weights(module, weights)
+    module.eval().to(device)
+    return {name: in_order(_detect(module, data, name, device)) for name in ("val", "test")}
+
+
 def assess(
     module: PoseTraining,
     data: PartDataModule,
-    weights: Path,
+    found: dict[str, list[SceneResult]],
     model_file: Path,
     tracked: Any,
-    device: torch.device,
     step: int,
 ) -> dict[str, Any]:
-    """Test the weights of a checkpoint on scenes never seen, log the figures, write ``model_file``.
+    """Judge what was found in scenes never seen, log the figures, write ``model_file``; for the first process.
 
     The confidence threshold is chosen on the validation scenes.
 
@@ -39,9 +51,6 @@ def assess(
         ``metrics`` (see ``attentionvote.evaluation.evaluate``; precision and recall at the threshold),
         ``confidence_threshold`` and ``test_scenes``.
     """
-    load_weights(module, weights)
-    module.eval().to(device)
-    found = {name: _detect(module, data, name, device) for name in ("val", "test")}
     threshold = best_threshold(found["val"], module.part)
     everything = evaluate(found["test"], module.part)
     kept = evaluate(confident(found["test"], threshold), module.part)
@@ -51,7 +60,7 @@ def assess(
     metadata = module.metadata | {"confidence_threshold": threshold, "test": metrics}
     save_trained(module.model, metadata, model_file)
     tracked.log_file("checkpoints/model.ckpt", model_file)
-    _draw(module, data, found["test"], threshold, tracked, device)
+    _draw(module, data, found["test"], threshold, tracked)
     return {
         "confidence_threshold": threshold,
         "test_scenes": len(found["test"]),
@@ -71,7 +80,6 @@ def _draw(
     results: list[SceneResult],
     threshold: float,
     tracked: Any,
-    device: torch.device,
 ) -> None:
     from attentionvote.tracking.figures import ap_threshold_figure, precision_recall_figure
     from attentionvote.tracking.scene_pictures import scene_picture
@@ -83,7 +91,7 @@ def _draw(
     tracked.log_figure("test/precision_recall.png", precision_recall_figure(lines, areas))
     against = curves(results, part)
     tracked.log_figure("test/ap_threshold.png", ap_threshold_figure(against.thresholds, {"test": against.ap}))
-    batch = next(iter(data.test_dataloader())).first(2).to(device)
+    batch = next(iter(data.test_dataloader())).first(2).to(module.device)
     for i, inputs in enumerate(picture_inputs(module, batch, threshold)):
         tracked.log_figure(f"test/scene_{i}.png", scene_picture(**inputs, title=f"{part.name}, test scene {i}"))
 

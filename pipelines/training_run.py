@@ -17,36 +17,45 @@ from json_files import write_json
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
+from training_data import prepare_data
 from training_job import MODEL, RESULT, RUN, TrainingJob
 from training_messages import plain_loader_errors, quiet_lightning
-from training_results import assess, log_losses
+from training_processes import FirstDoes, Place
+from training_results import assess, detect_everything, log_losses
 
 from attentionvote import __version__
-from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule, measure_clouds
+from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule
+from attentionvote.evaluation import SceneResult
 from attentionvote.model import AttentionVote
-from attentionvote.simulation import Sensor, generate_scene_set, scene_set_directory
+from attentionvote.simulation import Sensor
 from attentionvote.tracking.provenance import git_state
 from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
 from attentionvote.training.checkpoint import FORMAT, AtomicCheckpoints, usable_checkpoint
 from attentionvote.training.pictures import ScenePictures
 from attentionvote.training.progress import TrainingProgress
+from attentionvote.training.synced_norm import RowNormSync
+from attentionvote.training.termination import PlainTermination
 
 log = logging.getLogger("attentionvote.train")
-_CYCLES_PER_PROCESS = 5
 
 
 class TrainingRun:
-    """One training from data to tested model.
+    """One training from data to tested model, in this process or in this one among several.
+
+    Args:
+        place: this process among those of the training.
+        first_does: lets the first one work while the others wait.
 
     Raises:
         ValueError: with one sentence, when a setting of model, loss, data or trainer is impossible.
     """
 
-    def __init__(self, cfg: DictConfig, job: TrainingJob) -> None:
+    def __init__(self, cfg: DictConfig, job: TrainingJob, place: Place, first_does: FirstDoes) -> None:
         self.cfg, self.job, self.part = cfg, job, job.part
+        self.place, self.first_does = place, first_does
         part, t = job.part, cfg.trainer
         L.seed_everything(cfg.seed, verbose=False)
-        self.threads = t.threads or cores()
+        self.threads = t.threads or place.cores
         torch.set_num_threads(self.threads)
         box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
         arguments = OmegaConf.to_container(cfg.model, resolve=True)
@@ -92,22 +101,25 @@ class TrainingRun:
         with quiet_lightning():
             self.trainer = self._trainer()
 
-    def run(self) -> dict[str, Any]:
-        """Everything; the dictionary of the JSON line."""
+    def run(self) -> dict[str, Any] | None:
+        """Everything; the dictionary of the JSON line, None where the first process prints it."""
         start = time.monotonic()
         self._introduce()
-        clouds = self._measure()
+        clouds, digests = prepare_data(self.cfg, self.job, self.clouds, self.workers, self.place, self.first_does)
+        self.module.metadata["data"] |= digests
         data_seconds = time.monotonic() - start
         with plain_loader_errors(), quiet_lightning():
             data = self._data_module(clouds)
+            if self.place.rank:
+                self._fit(data, None)
+                self._detect(data)
+                return None
             with self._open_tracking(clouds) as tracked:
                 progress = self._fit(data, tracked)
                 losses = log_losses(tracked)
-                folder, step = self._checkpoints, self.trainer.global_step
-                weights = next(p for p in (folder / "best.ckpt", folder / "last.ckpt") if p.is_file())
-                model_file = self.job.directory / MODEL
-                device = self.trainer.strategy.root_device
-                assessed = assess(self.module, data, weights, model_file, tracked, device, step)
+                weights, found = self._detect(data)
+                model_file, step = self.job.directory / MODEL, self.trainer.global_step
+                assessed = assess(self.module, data, found, model_file, tracked, step)
                 result = {
                     "stage": "train",
                     "object": self.part.name,
@@ -139,24 +151,14 @@ class TrainingRun:
         counts = {split: spec.cycles * len(spec.drop_counts) for split, spec in self.job.specs.items()}
         log.info(
             "%s: %d/%d/%d scenes (train/val/test), %d points, %s parameters, %d epochs of batches of %d "
-            "on %s (%s, %d thread%s)%s",
+            "on %s (%s, %d thread%s%s)%s",
             self.part.name, counts["train"], counts["val"], counts["test"], self.cfg.data.points,
             f"{sum(p.numel() for p in self.module.parameters()):,}", self.cfg.trainer.max_epochs,
             self.cfg.trainer.batch_size, self.trainer.strategy.root_device, self.trainer.precision, self.threads,
-            "s" * (self.threads > 1), ", going on after an interruption" if self.job.run_id else "",
+            "s" * (self.threads > 1),
+            f" in each of {self.place.processes} processes" if self.place.processes > 1 else "",
+            ", going on after an interruption" if self.job.run_id else "",
         )  # fmt: skip
-
-    def _measure(self) -> dict[str, Clouds]:
-        clouds = {}
-        for split, spec in self.job.specs.items():
-            directory = scene_set_directory(Path(self.cfg.root) / "scenes", self.part.name, spec)
-            # A process needs seconds to start, about as long as a cycle takes.
-            workers = max(1, min(self.workers, spec.cycles // _CYCLES_PER_PROCESS))
-            scenes = generate_scene_set(self.part, spec, directory, workers)
-            self.module.metadata["data"][split] = scenes.digest
-            root = Path(self.cfg.root) / "clouds"
-            clouds[split] = measure_clouds(scenes, self.part, self.clouds, root, self.workers)
-        return clouds
 
     def _data_module(self, clouds: dict[str, Clouds]) -> PartDataModule:
         cfg = self.cfg
@@ -170,6 +172,8 @@ class TrainingRun:
             cfg.data.workers,
             self.augmentation,
             cfg.seed,
+            self.place.rank,
+            self.place.processes,
         )
 
     def _open_tracking(self, clouds: dict[str, Clouds]) -> Any:
@@ -192,6 +196,7 @@ class TrainingRun:
             "experiment": self.part.name,
             "name": f"{self.part.name}-{self.job.directory.name}",
             "params": choices,
+            "tags": {"processes": self.place.processes},
             "config_yaml": OmegaConf.to_yaml(cfg, resolve=True),
             "datasets": self.module.metadata["data"],
             "system_interval_s": cfg.tracking.system_interval,
@@ -217,6 +222,8 @@ class TrainingRun:
         callbacks: list[Callback] = [best, last, self.progress, self.pictures]
         if t.average_decay:
             callbacks.append(EMAWeightAveraging(decay=t.average_decay, use_buffers=True))
+        if self.place.processes > 1:
+            callbacks.append(PlainTermination())
         try:
             return self._lightning_trainer(callbacks)
         except (MisconfigurationException, RuntimeError) as error:  # no such device, say
@@ -226,7 +233,7 @@ class TrainingRun:
         t = self.cfg.trainer
         return L.Trainer(
             accelerator=t.accelerator,
-            devices=1,
+            **self.place.trainer_arguments(),
             precision=self._precision(),
             max_epochs=t.max_epochs,
             gradient_clip_val=t.gradient_clip,
@@ -235,14 +242,27 @@ class TrainingRun:
             num_sanity_val_steps=0,
             logger=False,
             callbacks=callbacks,
-            plugins=[self.checkpoint_files],
+            plugins=[self.checkpoint_files, *([RowNormSync()] if self.place.processes > 1 else [])],
             enable_progress_bar=False,
             enable_model_summary=False,
             default_root_dir=self.job.directory,
         )
 
-    def _fit(self, data: PartDataModule, tracked: Any) -> TrainingProgress:
-        """Train to the end, from wherever an earlier call came to."""
+    def _fit(self, data: PartDataModule, tracked: Any | None) -> TrainingProgress:
+        """Train to the end, from wherever an earlier call came to; only the first process tracks."""
+        trainer = self.trainer
+        if tracked is not None:
+            self._track(tracked)
+        shapes = {name: value.shape for name, value in self.module.state_dict().items()}
+        files = [self._checkpoints / "last.ckpt", self._checkpoints / "best.ckpt"]
+        start = self.first_does("checkpoint", lambda: str(usable_checkpoint(files, shapes) or ""))
+        trainer.fit(self.module, data, ckpt_path=start or None, weights_only=True)
+        if trainer.interrupted:
+            raise KeyboardInterrupt
+        return self.progress
+
+    def _track(self, tracked: Any) -> None:
+        """Metrics, checkpoints and pictures go to the run."""
         from attentionvote.tracking import RunLogger
         from attentionvote.tracking.scene_pictures import scene_picture
 
@@ -252,14 +272,13 @@ class TrainingRun:
 
         self.pictures.draw = draw
         self.checkpoint_files.before_save = tracked.flush_metrics
-        shapes = {name: value.shape for name, value in self.module.state_dict().items()}
-        start = usable_checkpoint([self._checkpoints / "last.ckpt", self._checkpoints / "best.ckpt"], shapes)
-        trainer = self.trainer
-        trainer.loggers = [RunLogger(tracked)]
-        trainer.fit(self.module, data, ckpt_path=start, weights_only=True)
-        if trainer.interrupted:
-            raise KeyboardInterrupt
-        return self.progress
+        self.trainer.loggers = [RunLogger(tracked)]
+
+    def _detect(self, data: PartDataModule) -> tuple[Path, dict[str, list[SceneResult]]]:
+        """The checkpoint that the training ends with, and what it finds (in the first process, of all)."""
+        files = [self._checkpoints / "best.ckpt", self._checkpoints / "last.ckpt"]
+        weights = Path(self.first_does("weights", lambda: str(next(path for path in files if path.is_file()))))
+        return weights, detect_everything(self.module, data, weights, self.trainer.strategy.root_device)
 
     def _precision(self) -> Any:
         if self.cfg.trainer.precision != "auto":

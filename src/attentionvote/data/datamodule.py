@@ -39,21 +39,37 @@ class CloudSamples(Dataset[Batch]):
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """(epoch, scene) in an order that depends on the seed and the epoch only; Lightning calls ``set_epoch``."""
+    """(epoch, scene) in an order that depends on the seed and the epoch only; Lightning calls ``set_epoch``.
 
-    def __init__(self, size: int, seed: int) -> None:
+    Args:
+        size: scenes.
+        seed: of the order.
+        batch_size: scenes a step, of all processes together; what fills no whole batch is left out.
+        rank, processes: which share of every batch this process gets.
+    """
+
+    def __init__(self, size: int, seed: int, batch_size: int = 1, rank: int = 0, processes: int = 1) -> None:
         self.size, self.seed, self.epoch = size, seed, 0
+        self.batch_size, self.rank, self.processes = batch_size, rank, processes
 
     def set_epoch(self, epoch: int) -> None:
         """Which epoch the next pass is."""
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return self.size
+        return self.size // self.batch_size * (self.batch_size // self.processes)
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
-        return ((self.epoch, int(index)) for index in order)
+        whole = order[: self.size // self.batch_size * self.batch_size]
+        share = whole.reshape(-1, self.processes, self.batch_size // self.processes)[:, self.rank]
+        return ((self.epoch, int(index)) for index in share.flatten())
+
+
+def scene_share(size: int, rank: int, processes: int) -> range:
+    """The scenes of ``size`` that a process looks at: each exactly once over all, in order, the first has the most."""
+    first, last = (-(-size * r // processes) for r in (rank, rank + 1))
+    return range(first, last)
 
 
 class PartDataModule(L.LightningDataModule):
@@ -63,10 +79,15 @@ class PartDataModule(L.LightningDataModule):
         train, val, test: measured clouds of scene sets that share no drop cycle.
         points: N, points a sample.
         layout: of the network, for the neighbourhoods.
-        batch_size: scenes a step.
-        workers: loader processes.
+        batch_size: scenes a step, of all processes together.
+        workers: loader processes of each process.
         augmentation: of training samples.
         seed: of everything random.
+        rank, processes: which share of every batch, and of the other scenes, this process gets. The shares of all
+            make the batches of one process, in its order.
+
+    Raises:
+        ValueError: when there are too few points or scenes.
     """
 
     def __init__(
@@ -80,6 +101,8 @@ class PartDataModule(L.LightningDataModule):
         workers: int,
         augmentation: Augmentation,
         seed: int,
+        rank: int = 0,
+        processes: int = 1,
     ) -> None:
         super().__init__()
         if points < layout.centers[0]:
@@ -93,20 +116,25 @@ class PartDataModule(L.LightningDataModule):
                     f"the {name} scenes must have points, but all {len(samples.clouds)} clouds in "
                     f"{samples.clouds.directory} are empty"
                 )
+            if len(samples) < processes:
+                raise ValueError(f"processes must be at most the {len(samples)} {name} scenes, got {processes}")
         if len(self.train) < batch_size:
             raise ValueError(f"batch_size must be at most the {len(self.train)} training scenes, got {batch_size}")
+        if batch_size % processes:
+            raise ValueError(f"batch_size must be a multiple of the {processes} processes, got {batch_size}")
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
+        self.rank, self.processes = rank, processes
         self.first_epoch = 0
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Shuffled, augmented, full batches only."""
-        sampler = EpochSampler(len(self.train), self.seed)
+        """Shuffled, augmented, full batches only; this process's share of each."""
+        sampler = EpochSampler(len(self.train), self.seed, self.batch_size, self.rank, self.processes)
         # Lightning opens the loader, whose processes fetch ahead, before it tells the sampler the epoch: without this a
         # continued training would see the samples of epoch 0 again.
         sampler.set_epoch(self.first_epoch)
         return DataLoader(
             self.train,
-            batch_size=self.batch_size,
+            batch_size=self.batch_size // self.processes,
             sampler=sampler,
             collate_fn=collate,
             num_workers=self.workers,
@@ -116,11 +144,11 @@ class PartDataModule(L.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """The validation scenes, always the same samples."""
+        """This process's share of the validation scenes, always the same samples."""
         return self._plain(self.val)
 
     def test_dataloader(self) -> DataLoader[Batch]:
-        """The test scenes, always the same samples."""
+        """This process's share of the test scenes, always the same samples."""
         return self._plain(self.test)
 
     def state_dict(self) -> dict[str, Any]:
@@ -138,4 +166,6 @@ class PartDataModule(L.LightningDataModule):
         return batch.to(device)
 
     def _plain(self, samples: CloudSamples) -> DataLoader[Batch]:
-        return DataLoader(samples, batch_size=self.batch_size, collate_fn=collate, num_workers=0)
+        share = scene_share(len(samples), self.rank, self.processes)
+        size = self.batch_size // self.processes
+        return DataLoader(samples, batch_size=size, sampler=share, collate_fn=collate, num_workers=0)

@@ -1,4 +1,8 @@
-"""The losses of the paper (section 3.4, Eqs. 1-11) and the dense supervision that trains faster beside them."""
+"""The losses of the paper (section 3.4, Eqs. 1-11) and the dense supervision that trains faster beside them.
+
+Where several processes share a batch, every term is this process's part of the mean over the whole batch: the parts of
+all processes add up to what one process would have computed.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ from attentionvote.data.samples import Batch
 from attentionvote.model import AttentionVote, Peaks, Poses, Votes
 from attentionvote.part import Part
 from attentionvote.training.pose_loss import RotationLoss, SymmetricPose
+from attentionvote.training.processes import everyones, rank, summed
 
 QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
 
@@ -156,7 +161,7 @@ class AttentionVoteLoss:
         with torch.no_grad():
             quality = self.quality(poses, assigned, batch)
         loss = torch.nn.functional.binary_cross_entropy_with_logits(poses.score, quality, reduction="none")
-        return {"confidence": loss.mean() if len(loss) else poses.score.sum()}
+        return {"confidence": masked_mean(loss, torch.ones_like(loss, dtype=torch.bool))}
 
     def quality(self, poses: Poses, assigned: Assignment, batch: Batch) -> Float[Tensor, " rows"]:
         """Share of the thresholds 2, 5, 10 % D that each pose meets; see ``LossSettings.one_per_instance``."""
@@ -179,7 +184,7 @@ class AttentionVoteLoss:
 def batch_loss(
     model: AttentionVote, loss: AttentionVoteLoss, batch: Batch, ramp: float, least_heat: float
 ) -> dict[str, Tensor]:
-    """All loss terms of one batch (Eq. 11).
+    """All loss terms of one batch (Eq. 11), this process's part of them.
 
     Args:
         ramp: 0 during the warm-up, when only the votes are trained; the proposals are then not computed at all.
@@ -192,10 +197,8 @@ def batch_loss(
     peaks = model.find_peaks(votes)
     heat = peaks.heat.flatten()
     rows = torch.nonzero((heat >= least_heat) & (heat > 0))[:, 0]
-    stride = -(-len(rows) // (loss.settings.rows_per_scene * len(batch.points)))
-    if stride > 1:  # which ones is as good as random, and the same in a continued training
-        rows = rows[int(rows.sum()) % stride :: stride]
-    if len(rows) < 2:  # batch statistics need two rows
+    rows, chosen = _even_choice(rows, loss.settings.rows_per_scene * len(batch.points), len(heat))
+    if chosen < 2:  # batch statistics need two rows
         return terms
     poses = model.regress(votes, peaks, rows)
     assigned = loss.assign(peaks, batch, rows)
@@ -210,7 +213,32 @@ def batch_loss(
     return terms
 
 
+def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[Int[Tensor, " chosen"], int]:
+    """Every n-th row of the whole batch, so that ``most`` a process are left at most on average.
+
+    Args:
+        rows: this process's, in rising order, counted from its own first place.
+        most: rows a process.
+        places: rows that each process could have; the whole batch is the processes' places one after the other.
+
+    Returns:
+        this process's share of the choice, and the number of all chosen rows.
+    """
+    told = everyones(torch.stack([rows.new_tensor(len(rows)), rows.sum()])).tolist()
+    count = sum(size for size, _ in told)
+    stride = -(-count // (most * len(told)))
+    if stride <= 1:
+        return rows, count
+    # Which ones is as good as random, and the same in a continued training.
+    first = sum(total + size * places * process for process, (size, total) in enumerate(told)) % stride
+    before = sum(size for size, _ in told[: rank()])
+    return rows[(first - before) % stride :: stride], len(range(first, count, stride))
+
+
 def masked_mean(values: Float[Tensor, "*rows"], mask: Bool[Tensor, "*rows"]) -> Float[Tensor, ""]:
-    """Mean of the values where ``mask`` holds; 0 with gradient 0 where it never does."""
+    """Sum of the values where ``mask`` holds over their number in all processes; 0 with gradient 0 where it never does.
+
+    In a process of its own that is the mean; the values of several processes add up to the mean over all.
+    """
     weight = mask.to(values.dtype)
-    return (values.masked_fill(~mask, 0.0) * weight).sum() / weight.sum().clamp(min=1.0)
+    return (values.masked_fill(~mask, 0.0) * weight).sum() / summed(weight.sum()).clamp(min=1.0)

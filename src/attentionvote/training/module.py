@@ -13,6 +13,7 @@ from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.model import AttentionVote, Predictions
 from attentionvote.part import Part
+from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY
 from attentionvote.training.detections import scene_results
 from attentionvote.training.losses import AttentionVoteLoss, batch_loss
@@ -61,11 +62,11 @@ class PoseTraining(L.LightningModule):
         self.model.voting_radius = self.voting_radius * (self.schedule.vote_radius_factor if ramp < 1 else 1.0)
         terms = batch_loss(self.model, self.loss, batch, ramp, self.train_heat)
         total = self.loss.total(terms, ramp)
-        self.log_dict(
-            {f"train/loss/{k}": v.detach() for k, v in terms.items()} | {"train/loss": total.detach()},
-            batch_size=len(batch.points),
-        )
-        return total
+        whole = processes.summed(torch.stack([*terms.values(), total]))
+        names = [*(f"train/loss/{k}" for k in terms), "train/loss"]
+        self.log_dict(dict(zip(names, whole, strict=True)), batch_size=len(batch.points))
+        # The gradients of several processes are averaged, but their parts of the loss add up.
+        return total * processes.count()
 
     def on_validation_epoch_start(self) -> None:
         """Nothing is found yet."""
@@ -76,8 +77,9 @@ class PoseTraining(L.LightningModule):
         self.results += self.detect(batch)
 
     def on_validation_epoch_end(self) -> None:
-        """Average precision at 10, 5 and 2 % of the diameter over all validation scenes."""
-        metrics = evaluate(self.results, self.part, add=False)
+        """Average precision at 10, 5 and 2 % of the diameter over all validation scenes, those of all processes."""
+        results = processes.in_order(self.results)
+        metrics = processes.from_first(evaluate(results, self.part, add=False) if processes.rank() == 0 else {})
         self.log_dict({f"val/{k}": v for k, v in metrics.items()})
         self.log("val/ap", (metrics["ap_10"] + metrics["ap_5"] + metrics["ap_2"]) / 3)
 
