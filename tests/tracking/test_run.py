@@ -150,3 +150,19 @@ def test_figure_names_with_a_step_stand_beside_each_other(run, tmp_path):
     assert run.download("val/pr.png", tmp_path).read_bytes() == b"latest"
     names = sorted(path.name for path in run.download("val/pr", tmp_path / "all").iterdir())
     assert names == ["step_00000001.png", "step_00000020.png"]
+
+
+def test_a_run_below_another_one_keeps_its_parent(store, client):
+    above, other = (tracking.start_run(store, "grids", name=name, system_interval_s=0) for name in ("above", "other"))
+    below = tracking.start_run(store, "rod", system_interval_s=0, parent=above.id)
+    below.close()
+    tracking.start_run(store, "rod", run_id=below.id, system_interval_s=0, parent=other.id).close()
+    assert client.get_run(below.id).data.tags["mlflow.parentRunId"] == above.id
+    alone = tracking.start_run(store, "rod", system_interval_s=0)
+    alone.close()
+    tracking.start_run(store, "rod", run_id=alone.id, system_interval_s=0, parent=other.id).close()
+    assert client.get_run(alone.id).data.tags["mlflow.parentRunId"] == other.id
+    with pytest.raises(ValueError, match=r"parent must name a run in sqlite.*got 'nobody'"):
+        tracking.start_run(store, "rod", parent="nobody", system_interval_s=0)
+    for run in (above, other):
+        run.close()

@@ -8,10 +8,16 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from attentionvote.tracking import provenance
 from attentionvote.tracking.run import Run, status_of
 from attentionvote.tracking.store import connect, experiment_id, resolve_store
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run as MlflowRun
+
+PARENT_TAG = "mlflow.parentRunId"  # what MLflow's pages nest runs by
 
 
 def start_run(
@@ -25,6 +31,7 @@ def start_run(
     datasets: Mapping[str, str] | None = None,
     repository: Path | None = None,
     system_interval_s: float = 15.0,
+    parent: str | None = None,
 ) -> Run:
     """Open a new run, or the run of ``run_id`` again.
 
@@ -39,24 +46,30 @@ def start_run(
         datasets: full digest by use (``{"train": sha256}``).
         repository: folder whose git state is recorded; the working directory by default.
         system_interval_s: seconds between samples of the machine's load, 0 for none.
+        parent: id of the run that this one is shown below, in the same store; a resumed run that has a parent keeps it.
 
     Raises:
-        ValueError: the store's URI is impossible, or it has no run ``run_id``.
+        ValueError: the store's URI is impossible, or it has no run ``run_id`` or ``parent``.
         ConnectionError: the tracking server does not answer.
     """
     uri = resolve_store(store)
     client = connect(uri)
     from mlflow.exceptions import MlflowException
 
+    def known(argument: str, name: str) -> MlflowRun:
+        try:
+            return client.get_run(name)
+        except MlflowException as error:
+            raise ValueError(f"{argument} must name a run in {uri}, got {name!r}, which it does not have") from error
+
+    below = {} if parent is None else {PARENT_TAG: known("parent", parent).info.run_id}
     if run_id is None:
-        created = client.create_run(experiment_id(client, uri, experiment), run_name=name, tags={"sessions": "0"})
-        run_id = created.info.run_id
+        place = experiment_id(client, uri, experiment)
+        run_id = client.create_run(place, run_name=name, tags={"sessions": "0", **below}).info.run_id
         session = 0
     else:
-        try:
-            found = client.get_run(run_id)
-        except MlflowException as error:
-            raise ValueError(f"run_id must name a run in {uri}, got {run_id!r}, which it does not have") from error
+        found = known("run_id", run_id)
+        below = {} if PARENT_TAG in found.data.tags else below
         if found.info.lifecycle_stage == "deleted":
             client.restore_run(run_id)
         client.update_run(run_id, status="RUNNING")  # FAILED or KILLED before, or left RUNNING by a kill -9
@@ -64,7 +77,7 @@ def start_run(
     run = Run(client, uri, run_id, system_interval_s)
     try:
         _record_origin(run, session, config_yaml, repository or Path.cwd())
-        run.log_tags({**(tags or {}), "sessions": session})
+        run.log_tags({**(tags or {}), **below, "sessions": session})
         run.log_params(params or {})
         if datasets:
             run.log_datasets(datasets)

@@ -79,8 +79,11 @@ def artifact_root(uri: str) -> Path | None:
 
 
 @contextlib.contextmanager
-def _exclusive(uri: str) -> Iterator[None]:
-    """One process at a time: MLflow's first touch of an empty SQLite file is not safe for several."""
+def exclusive(uri: str) -> Iterator[None]:
+    """One process at a time at an SQLite store, whose first touch by MLflow is not safe for several; not re-entrant.
+
+    A server or another database is not held.
+    """
     if not uri.startswith("sqlite:///"):
         yield
         return
@@ -132,7 +135,7 @@ def connect(uri: str) -> MlflowClient:
     # One sentence of ours says that a server is away; urllib3 and alembic would add a page.
     for name in ("urllib3.connectionpool", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    with _exclusive(uri), warnings.catch_warnings():
+    with exclusive(uri), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
         try:
             return MlflowClient(uri, registry_uri=uri)
@@ -150,7 +153,7 @@ def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
     from mlflow.exceptions import MlflowException
 
     root = artifact_root(uri)
-    with _exclusive(uri):
+    with exclusive(uri):
         experiment = client.get_experiment_by_name(name)
         if experiment is None:
             try:
