@@ -1,0 +1,144 @@
+"""Jobs as tasks of a Ray cluster: an existing one, or one of this machine for the length of the call."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import pickle
+import socket
+import uuid
+from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from attentionvote.execution.failures import Attempts
+from attentionvote.execution.outcome import perform, worker_environment
+
+_OBJECT_STORE = 512 * 2**20  # bytes, of a cluster of this machine: results wait here for a moment only
+_held: tuple[str, Callable[[Any], Any]] | None = None  # of a worker process: a call's token and its task
+
+
+@dataclass(frozen=True)
+class RayCluster:
+    """A Ray cluster.
+
+    Args:
+        address: ``auto`` joins the cluster of this machine, ``host:6379`` another one; None starts one here for the
+            length of the call. A program that has called ``ray.init`` itself keeps its own.
+        gpus: GPUs a job takes; Ray hides all of them from a job that takes none.
+    """
+
+    address: str | None = None
+    gpus: float = 0
+
+    def check(self) -> None:
+        """Whether Ray is installed.
+
+        Raises:
+            ValueError: when it is not.
+        """
+        if importlib.util.find_spec("ray") is None:
+            raise ValueError(
+                "executor=ray needs the package ray, which is not installed: install the extra cluster "
+                "(pip install '.[cluster]'), or choose executor=local"
+            )
+
+    def outcomes(
+        self, task: Callable[[Any], Any], jobs: Sequence[Any], workers: int, retries: int, threads: int
+    ) -> Generator[tuple[int, bytes], None, None]:
+        """See ``Executor``.
+
+        Raises:
+            ConnectionError: when there is no cluster at ``address``.
+        """
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+        import ray
+
+        ours = not ray.is_initialized()
+        if ours:
+            self._join(ray, workers * threads)
+        try:
+            yield from self._run(ray, task, jobs, workers, Attempts(retries, len(jobs)), threads)
+        finally:
+            if ours:
+                ray.shutdown()
+
+    def _join(self, ray: Any, cores: int) -> None:
+        own = {} if self.address else {"num_cpus": cores, "include_dashboard": False}
+        own |= {} if self.address else {"object_store_memory": _OBJECT_STORE}
+        try:
+            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **own)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            first = str(error).strip().partition("\n")[0]
+            raise ConnectionError(
+                f"the Ray cluster at address={self.address or 'null'} cannot be joined ({first}): start one with "
+                "`ray start --head`, or set cluster.address=null for one of this machine"
+            ) from error
+
+    def _run(
+        self,
+        ray: Any,
+        task: Callable[[Any], Any],
+        jobs: Sequence[Any],
+        workers: int,
+        attempts: Attempts,
+        threads: int,
+    ) -> Generator[tuple[int, bytes], None, None]:
+        remote = ray.remote(_perform).options(
+            num_cpus=threads,
+            num_gpus=self.gpus,
+            max_retries=0,  # counted here, as everywhere
+            runtime_env={"env_vars": worker_environment(threads)},
+        )
+        token, stored = uuid.uuid4().hex, ray.put(pickle.dumps(task))
+        waiting = list(reversed(range(len(jobs))))
+        running: dict[Any, int] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    index = waiting.pop()
+                    running[remote.remote(token, [stored], os.getcwd(), pickle.dumps(jobs[index]))] = index
+                for reference in ray.wait(list(running), num_returns=1)[0]:
+                    index = running.pop(reference)
+                    try:
+                        outcome = ray.get(reference)
+                    except ray.exceptions.RayError as error:  # not the task's: that is an outcome
+                        attempts.died(index, type(error).__name__)
+                        waiting.append(index)
+                        continue
+                    attempts.finished += 1
+                    yield index, outcome
+        finally:
+            for reference in running:
+                with suppress(ray.exceptions.RayError):
+                    ray.cancel(reference, force=True)
+
+
+def _perform(token: str, stored: list[Any], folder: str, job: bytes) -> bytes:
+    """One job in a worker of the cluster, in the driver's working directory."""
+    return perform(_Call(token, stored, folder), job)
+
+
+@dataclass(frozen=True)
+class _Call:
+    """Fetches the task once a worker process."""
+
+    token: str
+    stored: list[Any]
+    folder: str
+
+    def __call__(self, job: bytes) -> Any:
+        global _held
+        if _held is None or _held[0] != self.token:
+            import ray
+
+            if not Path(self.folder).is_dir():
+                raise FileNotFoundError(
+                    f"the Ray worker on {socket.gethostname()} has no folder {self.folder}: the machines of a cluster "
+                    "must share the file system under the same path (docs/scaling.md)"
+                )
+            os.chdir(self.folder)
+            _held = self.token, pickle.loads(ray.get(self.stored[0]))
+        return _held[1](pickle.loads(job))
