@@ -46,7 +46,9 @@ class PromotionJob:
         gates = cfg.gates
         floors = {name: value for name, value in gates.floors.items() if value is not None}
         margins = {name: value for name, value in gates.margins.items() if value is not None}
-        rules = Rules(floors, margins, gates.latency_p95_ms, gates.scenes, Limits(**gates.parity))
+        rules = Rules(
+            floors, margins, gates.latency_p95_ms, gates.scenes, Limits(**gates.parity), list(gates.provenance)
+        )
         versions = Versions(cfg.tracking.store, evaluation.part.name)
         history = History(versions)
         standing = stand(versions, history)

@@ -131,3 +131,9 @@ def test_missing_provenance_fails_one_gate_each(card):
         (card, replace(ORIGIN, signed_by=""), "signature"),
     ):
         assert [gate.name for gate in judged(card_, origin=origin).values() if not gate.holds] == [name]
+
+
+def test_only_the_provenance_that_is_demanded_is_judged(card):
+    gates = judged(replace(card, commit=""), rules=replace(RULES, provenance=("signature",)))
+    assert list(gates)[-2:] == ["parity", "signature"]
+    assert all(gate.holds for gate in gates.values())

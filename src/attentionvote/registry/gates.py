@@ -5,7 +5,7 @@ Plain numbers in, sentences out: nothing here measures, reads or writes. A gate 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,8 @@ from attentionvote.contract import ModelCard
 from attentionvote.evaluation import interval
 from attentionvote.evaluation.scene_result import Array
 from attentionvote.export import Limits, Parity
+
+PROVENANCE = ("commit", "data", "config", "versions", "signature")
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Rules:
         latency_p95_ms: largest 95th percentile of an estimate on the machine that promotes.
         scenes: least size of the evaluation set.
         parity: what the proof of the export may have measured at most.
-
+        provenance: names of what must be known of a model's origin, of ``PROVENANCE``.
     """
 
     floors: Mapping[str, float]
@@ -34,6 +36,7 @@ class Rules:
     latency_p95_ms: float
     scenes: int
     parity: Limits
+    provenance: Sequence[str] = PROVENANCE
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,8 @@ def judge(
     gates += _floors(rules.floors, candidate)
     if champion is not None:
         gates += _not_worse(rules.margins, candidate, champion)
-    return [*gates, _latency(rules.latency_p95_ms, candidate), _parity(card, rules.parity), *_provenance(card, origin)]
+    gates += [_latency(rules.latency_p95_ms, candidate), _parity(card, rules.parity)]
+    return gates + [gate for gate in _provenance(card, origin) if gate.name in rules.provenance]
 
 
 def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
