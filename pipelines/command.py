@@ -7,7 +7,8 @@ A verb is a script ``pipelines/<verb>.py`` with a function ``run(cfg) -> dict``:
 
 The dictionary is printed as the only line on stdout, one JSON object; everything else that is
 printed while the verb runs, by anybody, goes to stderr. Exit codes: 0 success, 2 impossible
-configuration (before any work), 130 interrupted, 1 anything else. Heavy imports belong inside ``run``, so that
+configuration (before any work), 130 interrupted, 1 anything else. With ``-m`` the words are a grid of jobs
+(``multirun.py``). Heavy imports belong inside ``run``, so that
 ``--help`` and a misspelt word are answered at once.
 """
 
@@ -26,18 +27,23 @@ from typing import Any, NoReturn
 
 from configuration import CONF, ConfigurationError, choices, compose, leaves, sentence
 from hydra.errors import InstantiationException
+from job_process import join_starter, report_failure
+from multirun import run_grid
 from omegaconf import DictConfig, OmegaConf
 
 __all__ = ["ConfigurationError", "command", "configuring"]
 
 Run = Callable[[DictConfig], dict[str, Any] | None]
 Defaults = Callable[[list[str]], list[str]]
+Check = Callable[[DictConfig], object]
 LOGS = Path("outputs/logs")
 # Threads that wait for work sleep: spinning ones make a shared machine several times slower (torch reads this once).
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
-def command(verb: str, run: Run, *, defaults: Defaults | None = None, conf: Path = CONF) -> NoReturn:
+def command(
+    verb: str, run: Run, *, defaults: Defaults | None = None, check: Check | None = None, conf: Path = CONF
+) -> NoReturn:
     """Run a verb with the words of the command line and leave the process.
 
     Args:
@@ -45,18 +51,23 @@ def command(verb: str, run: Run, *, defaults: Defaults | None = None, conf: Path
         run: does the work; its dictionary becomes the JSON line (None: another process of the same work prints it).
         defaults: given the user's words, further overrides that stand for the machine's default
             (they come first, so the user's words win).
+        check: raises when a configuration cannot work, before the first job of a grid starts; ``run`` checks its own.
         conf: folder of the configuration files.
     """
     words = sys.argv[1:]
+    join_starter()
     _log_to_stderr()
     if any(word in ("-h", "--help") for word in words):
         print(_help(verb, conf))
         sys.exit(0)
     with _one_sentence(verb):
         said = [word for word in words if not word.startswith("-")]
+        flags = {word for word in words if word.startswith("-")}
         machine = defaults(said) if defaults is not None else []
-        if len(said) == len(words):
+        if not flags:
             _print_result(run, compose(verb, [*machine, *words], conf))
+        elif flags <= {"-m", "--multirun"}:
+            run_grid(verb, said, machine, lambda job: compose(verb, job, conf), _configuring(check))
         else:
             _with_hydra(verb, run, words, machine, conf)
     sys.exit(0)
@@ -116,17 +127,21 @@ def _jsonable(value: Any) -> Any:
     return str(value)
 
 
-def _with_hydra(verb: str, run: Run, words: Sequence[str], machine: Sequence[str], conf: Path) -> None:
-    """Hydra's own flags (``--multirun``, ``--cfg job`` ...): every job of a grid is checked before the first starts."""
-    import hydra
-    from configuration import parse
-    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+def _configuring(check: Check | None) -> Check | None:
+    """The check with its expected errors made configuration errors."""
+    if check is None:
+        return None
 
-    if "-m" in words or "--multirun" in words:
-        said = [word for word in words if not word.startswith("-")]
-        grid = [o for o in parse([*machine, *said]) if not o.key_or_group.startswith("hydra")]
-        for job in BasicSweeper.split_arguments(grid, None)[0]:
-            compose(verb, job, conf)
+    def checked(cfg: DictConfig) -> None:
+        with configuring(f"object {cfg.object.name}"):
+            check(cfg)
+
+    return checked
+
+
+def _with_hydra(verb: str, run: Run, words: Sequence[str], machine: Sequence[str], conf: Path) -> None:
+    """Hydra's own flags (``--cfg job``, ``--info`` ...), which show and run nothing."""
+    import hydra
 
     def task(cfg: DictConfig) -> None:
         with _one_sentence(verb):
@@ -136,7 +151,6 @@ def _with_hydra(verb: str, run: Run, words: Sequence[str], machine: Sequence[str
     own_defaults = {
         "hydra.run.dir": ".",
         "hydra.output_subdir": "null",
-        "hydra.sweep.dir": f"outputs/multirun/{time.strftime('%Y-%m-%d_%H-%M-%S')}",
         "hydra/job_logging": "none",
         "hydra/hydra_logging": "none",
     }
@@ -176,6 +190,7 @@ def _one_sentence(verb: str) -> Iterator[None]:
 def _leave(message: str, code: int) -> NoReturn:
     sys.stdout.flush()
     print(message, file=sys.stderr, flush=True)
+    report_failure(message.partition(": ")[2])
     raise SystemExit(code) from None
 
 

@@ -58,6 +58,13 @@ def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
         return training.run()
 
 
+def check(cfg: DictConfig) -> None:
+    """What a grid asks of every job before the first starts: the parts of its configuration fit together."""
+    from training_job import find_training
+
+    find_training(cfg)
+
+
 def preset_of_hardware(words: list[str]) -> list[str]:
     """``experiment=gpu`` where torch can use a GPU, else ``experiment=compact``, unless the user named one.
 
@@ -83,4 +90,4 @@ def preset_of_hardware(words: list[str]) -> list[str]:
 
 if __name__ == "__main__":
     with failing_at_once(os.environ):
-        command("train", run, defaults=preset_of_hardware)
+        command("train", run, defaults=preset_of_hardware, check=check)

@@ -200,6 +200,7 @@ class TrainingRun:
             "config_yaml": OmegaConf.to_yaml(cfg, resolve=True),
             "datasets": self.module.metadata["data"],
             "system_interval_s": cfg.tracking.system_interval,
+            "parent": cfg.tracking.parent,
         }
         run_id = self.job.run_id
         try:

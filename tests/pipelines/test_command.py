@@ -115,20 +115,6 @@ def test_ctrl_c_says_how_to_go_on(verb: Path) -> None:
     assert err.strip().endswith("fake: interrupted; run the same command to resume")
 
 
-def test_a_grid_runs_job_by_job(verb: Path) -> None:
-    done = call(verb, "-m", "object=gear", "do=it", "trainer.lr=0.1,0.2")
-    assert done.returncode == 0, done.stderr
-    assert [json.loads(line)["lr"] for line in done.stdout.splitlines()] == [0.1, 0.2]
-    assert sorted(p.name for p in verb.parent.iterdir()) == ["conf", "fake.py", "outputs"]
-
-
-def test_a_grid_with_an_impossible_job_does_not_start(verb: Path) -> None:
-    done = call(verb, "object=gear", "do=it", "trainer.lr=0.1,abc", "-m")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "got 'abc'" in done.stderr
-    assert "working" not in done.stderr
-
-
 def test_hydras_own_flags_still_work(verb: Path) -> None:
     done = call(verb, "--cfg", "job", "object=gear")
     assert done.returncode == 0, done.stderr
