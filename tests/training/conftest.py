@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import pickle
+import socket
+import traceback
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -14,6 +20,7 @@ from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternio
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.model import AttentionVote, find_neighborhoods
 from attentionvote.part import Part
+from attentionvote.training.processes import joined
 
 TILTED = (1.0, 2.0, 2.0)
 ACROSS = (2.0, 1.0, -2.0)  # perpendicular to it
@@ -137,3 +144,47 @@ def make_sample() -> Callable[..., Batch]:
 def make_scenes() -> Callable[..., Batch]:
     """A batch of scenes with these numbers of instances."""
     return lambda *instances: collate([scene_sample(7 + i, n) for i, n in enumerate(instances)])
+
+
+def _member(rank: int, count: int, port: int, work: Callable[[int], Any], answer: Connection) -> None:
+    os.environ.update(RANK=str(rank), WORLD_SIZE=str(count), MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+    torch.set_num_threads(1)
+    try:
+        with joined(torch.device("cpu")) as first_does:
+            result = work(rank) if work.__code__.co_argcount == 1 else work(rank, first_does)  # type: ignore[call-arg]
+        answer.send_bytes(pickle.dumps((result, "")))  # plain bytes: tensors would be shared with a process that ends
+    except BaseException:
+        answer.send_bytes(pickle.dumps((None, traceback.format_exc())))
+    os._exit(0)
+
+
+def run_in_processes(count: int, work: Callable[..., Any]) -> list[Any]:
+    """``work(rank)``, or ``work(rank, first_does)``, in real processes joined by gloo; what each returned.
+
+    They are forks of this one: importing torch again would take ten seconds each.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    context, started = multiprocessing.get_context("fork"), []
+    for rank in range(count):
+        answers, answer = context.Pipe(duplex=False)
+        process = context.Process(target=_member, args=(rank, count, port, work, answer))
+        process.start()
+        answer.close()
+        started.append((process, answers))
+    results = []
+    for process, answers in started:
+        try:
+            assert answers.poll(60), "a process hangs"
+            result, error = pickle.loads(answers.recv_bytes())
+        finally:
+            process.kill()
+        assert not error, error
+        results.append(result)
+    return results
+
+
+@pytest.fixture(scope="session")
+def in_processes() -> Callable[[int, Callable[..., Any]], list[Any]]:
+    return run_in_processes

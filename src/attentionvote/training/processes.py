@@ -116,8 +116,12 @@ def joined(device: torch.device) -> Iterator[FirstDoes]:
 
     try:
         yield first_does
-        # torchrun on another machine would wait five minutes at most for the first process's last work.
+        # The first one leaves last: the store may be in its process, and torchrun elsewhere would not wait for long.
         first_does("end", lambda: None)
+        if own_rank:
+            store.set(f"left/{own_rank}", "")
+        else:
+            store.wait([f"left/{other}" for other in range(1, world_size)], _TIMEOUT)
         dist.destroy_process_group()
     finally:
         _objects = None
