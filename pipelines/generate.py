@@ -2,7 +2,8 @@
 
     make generate OBJECT=connecting_rod [ARGS="simulation=fast simulation.cycles.train=40"]
 
-Interrupted, also by kill -9, it goes on where it was. What exists is not generated again.
+Interrupted, also by kill -9, it goes on where it was. What exists is not generated again. Many machines share the work
+with executor=ray or executor=slurm (docs/scaling.md).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from command import ConfigurationError, command, configuring
+from executors import executor_of
 from hardware import cores
 from omegaconf import DictConfig, OmegaConf
 
@@ -31,6 +33,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         part = instantiate(cfg.object)
     with configuring():
         specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation))
+        executor = executor_of(cfg)
     unknown = [split for split in cfg.splits if split not in specs]
     if unknown or not cfg.splits:
         raise ConfigurationError(f"splits must be among {', '.join(specs)}; got {list(cfg.splits)}")
@@ -39,7 +42,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         directory = scene_set_directory(Path(cfg.root), part.name, specs[split])
         if cfg.force and directory.exists():
             shutil.rmtree(directory)
-        scenes = generate_scene_set(part, specs[split], directory, cfg.workers or cores())
+        scenes = generate_scene_set(part, specs[split], directory, cfg.workers or cores(), executor=executor)
         log.info("%s: %d scenes of %d cycles in %s", split, len(scenes), scenes.cycles, directory)
         sets[split] = {
             "directory": str(directory),

@@ -6,6 +6,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
+from executors import executor_of
 from omegaconf import DictConfig
 from training_job import TrainingJob
 from training_processes import FirstDoes, Place
@@ -31,14 +32,15 @@ def prepare_data(
         ValueError: when a process does not see what the first one has made.
     """
     made: dict[str, tuple[Clouds, SceneSet, Path]] = {}
+    executor = executor_of(cfg)
 
     def make() -> dict[str, Any]:
         for split, spec in job.specs.items():
             directory = scene_set_directory(Path(cfg.root) / "scenes", job.part.name, spec)
             # A process needs seconds to start, about as long as a cycle takes.
             few = max(1, min(workers, spec.cycles // _CYCLES_PER_PROCESS))
-            scenes = generate_scene_set(job.part, spec, directory, few)
-            clouds = measure_clouds(scenes, job.part, settings, Path(cfg.root) / "clouds", workers)
+            scenes = generate_scene_set(job.part, spec, directory, few, executor=executor)
+            clouds = measure_clouds(scenes, job.part, settings, Path(cfg.root) / "clouds", workers, executor=executor)
             made[split] = clouds, scenes, directory
         return {split: [str(d), str(c.directory), s.digest] for split, (c, s, d) in made.items()}
 

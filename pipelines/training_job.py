@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from executors import executor_of
 from folder_lock import locked_folder
 from hydra.utils import instantiate
 from json_files import read_json
@@ -21,7 +22,10 @@ from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_specs
 
 log = logging.getLogger("attentionvote.train")
 # What may change between two calls that mean the same training: it does not change what is learned.
-_NOT_IDENTITY = ("resume", "force", "workers", "tracking", "outputs", "root", "data.workers", "trainer.threads")
+NOT_IDENTITY = (
+    *("resume", "force", "workers", "executor", "cluster", "tracking", "outputs", "root"),
+    *("data.workers", "trainer.threads"),
+)
 RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
 
 
@@ -71,7 +75,7 @@ def find_training(cfg: DictConfig) -> TrainingJob:
     _check(cfg, specs)
     plain = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(plain, dict)
-    for key in _NOT_IDENTITY:
+    for key in NOT_IDENTITY:
         section, _, leaf = key.rpartition(".")
         (plain[section] if section else plain).pop(leaf, None)
     digest = hashlib.sha256(json.dumps([plain, part.digest], sort_keys=True).encode()).hexdigest()
@@ -82,6 +86,7 @@ def _check(cfg: DictConfig, specs: dict[str, SceneSetSpec]) -> None:
     from attentionvote.tracking.store import resolve_store
 
     resolve_store(cfg.tracking.store)
+    executor_of(cfg)
     Sensor(**cfg.data.sensor)
     for split in ("train", "val", "test"):
         if split not in specs:

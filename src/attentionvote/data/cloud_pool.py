@@ -1,89 +1,65 @@
-"""Measures the clouds of a scene set in this process or in several."""
+"""Measures the clouds of a scene set here, in several processes or on several machines.
+
+Workers measure, this process writes the rows: they lie in files that are mapped into memory, and pages that two
+machines have mapped would overwrite each other's rows.
+"""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
-from pathlib import Path
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
 
 from numpy.typing import NDArray
 
-from attentionvote.data.clouds import CloudSettings, measure, measure_into, open_arrays
+from attentionvote.data.clouds import CloudSettings, measure, measure_into
+from attentionvote.execution import Executor, WorkerDied, run_all
 from attentionvote.part import Part
-from attentionvote.simulation import PartCaster, SceneRecord, SceneSet
-
-_Job = tuple[dict[str, NDArray], Sequence[SceneRecord], PartCaster, CloudSettings]
-_job: _Job | None = None  # of a worker process
+from attentionvote.scene import Scene
+from attentionvote.simulation import PartCaster, SceneRecord
 
 
-def run_tasks(
-    tasks: Sequence[Sequence[int]],
+@dataclass(frozen=True)
+class CloudTask:
+    """Measures a scene; a worker builds the ray caster for its first one."""
+
+    part: Part
+    settings: CloudSettings
+
+    def __call__(self, record: SceneRecord) -> Scene:
+        """Its cloud."""
+        return measure(record, self._caster, self.settings)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_caster"}
+
+    @cached_property
+    def _caster(self) -> PartCaster:
+        return PartCaster(self.part)
+
+
+def run_scenes(
+    indices: Sequence[int],
     workers: int,
-    directory: Path,
-    scenes: SceneSet,
-    part: Part,
-    settings: CloudSettings,
+    arrays: dict[str, NDArray],
+    records: Sequence[SceneRecord],
+    task: CloudTask,
+    executor: Executor | None = None,
 ) -> Iterator[None]:
-    """Measure the scenes of every task (indices) into the arrays of ``directory``; yields once a task.
+    """Measure these scenes of ``records`` into ``arrays``; yields once a scene.
 
     Raises:
-        OSError: when a worker process died.
+        OSError: when the worker of one scene died again and again.
     """
-    if workers <= 1:
-        job = open_arrays(directory, "r+"), scenes.records, PartCaster(part), settings
-        for task in tasks:
-            _measure(job, task)
-            yield None
-        return
-    before = multiprocessing.active_children()
-    arguments = (directory, scenes, part, settings)
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker, arguments)
-    futures: list[Future[None]] = []
-    finished = False
+    jobs = [records[index] for index in indices]
     try:
-        futures = [pool.submit(_work, task) for task in tasks]
-        for future in as_completed(futures):
-            yield future.result()
-        finished = True
-    except BrokenProcessPool as error:
+        with closing(run_all(task, jobs, executor, workers=max(1, workers))) as results:
+            for job, scene in results:
+                measure_into(arrays, indices[job], scene)
+                yield None
+    except WorkerDied as error:
         raise OSError(
-            "a worker process died while measuring clouds (out of memory?); what is measured is kept, "
-            "start again to go on"
+            f"a worker process died while measuring clouds (out of memory? {error.how}) {error.times} times at scene "
+            f"{indices[error.job]}; what is measured is kept, start again to go on"
         ) from error
-    finally:
-        if not finished:  # Ctrl-C or an error: a scene half written has no mark yet
-            for child in set(multiprocessing.active_children()) - set(before):
-                child.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _measure(job: _Job, task: Sequence[int]) -> None:
-    arrays, records, caster, settings = job
-    for index in task:
-        measure_into(arrays, index, measure(records[index], caster, settings))
-
-
-def _start_worker(directory: Path, scenes: SceneSet, part: Part, settings: CloudSettings) -> None:
-    global _job
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    _job = open_arrays(directory, "r+"), scenes.records, PartCaster(part), settings
-
-
-def _die_with_parent() -> None:
-    """End this worker when its parent is gone, also after kill -9."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-
-def _work(task: Sequence[int]) -> None:
-    assert _job is not None
-    _measure(_job, task)

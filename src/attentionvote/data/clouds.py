@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.execution import Executor
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.part import Part
 from attentionvote.scene import Scene
 from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor, synthesize
 
 _VERSION = 1
-_SCENES_PER_TASK = 4
 _SCENES_PER_PROCESS = 24
 
 
@@ -123,7 +123,13 @@ def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) ->
 
 
 def measure_clouds(
-    scenes: SceneSet, part: Part, settings: CloudSettings, root: Path, workers: int, progress: bool = True
+    scenes: SceneSet,
+    part: Part,
+    settings: CloudSettings,
+    root: Path,
+    workers: int,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> Clouds:
     """Measure what is missing of a scene set's clouds and open them.
 
@@ -137,10 +143,12 @@ def measure_clouds(
         root: clouds are kept in ``root/<part>/<key>``.
         workers: processes; the result does not depend on it.
         progress: show a progress bar on stderr.
+        executor: where the workers are; default this machine. Nor does the result depend on it.
 
     Raises:
-        ValueError: when the stored clouds are damaged.
-        OSError: when a worker process died; what is measured is kept and the next call goes on from there.
+        ValueError: when the stored clouds are damaged, or the executor cannot work here.
+        OSError: when the worker of one scene died again and again; what is measured is kept and the next call goes on
+            from there.
     """
     directory = root / part.name / settings.key(scenes.digest)[:16]
     directory.mkdir(parents=True, exist_ok=True)
@@ -149,20 +157,19 @@ def measure_clouds(
         create_arrays(directory, len(scenes), settings.pool)
         done = open_arrays(directory, "r")["done"]
         missing = [int(i) for i in np.flatnonzero(done == 0)]
-        tasks = [missing[i : i + _SCENES_PER_TASK] for i in range(0, len(missing), _SCENES_PER_TASK)]
-        if tasks:
-            from attentionvote.data.cloud_pool import run_tasks
+        if missing:
+            from attentionvote.data.cloud_pool import CloudTask, run_scenes
 
             # A process needs seconds to start, a scene a fraction of one.
-            results = run_tasks(
-                tasks, min(workers, len(missing) // _SCENES_PER_PROCESS), directory, scenes, part, settings
-            )
+            workers = min(workers, len(missing) // _SCENES_PER_PROCESS)
+            arrays, task = open_arrays(directory, "r+"), CloudTask(part, settings)
+            results = run_scenes(missing, workers, arrays, scenes.records, task, executor)
             if progress:
                 from rich.console import Console
                 from rich.progress import track
 
                 console = Console(stderr=True)
-                for _ in track(results, f"{part.name}: measuring clouds", len(tasks), console=console):
+                for _ in track(results, f"{part.name}: measuring clouds", len(missing), console=console):
                     pass
             for _ in results:
                 pass

@@ -14,8 +14,8 @@ import pickle
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,8 @@ class SlurmArray:
         system: ``slurm``, or ``local``: processes of this machine, as a rehearsal.
         minutes: time limit of an element of the array.
         memory_gb: of an element; None is the partition's default.
-        partition, account: of sbatch; None is the cluster's default.
+        partition, account: of sbatch; None is the cluster's default. Other options: the SBATCH_ variables of sbatch.
         gpus: GPUs an element takes.
-        extra: other options of sbatch without their dashes, e.g. ``{"constraint": "avx2"}``.
         poll_s: seconds between two looks into the folder.
         settle_s: how long an outcome of an ended element may take to become visible here (NFS).
     """
@@ -49,7 +48,6 @@ class SlurmArray:
     partition: str | None = None
     account: str | None = None
     gpus: float = 0
-    extra: Mapping[str, Any] = field(default_factory=dict)
     poll_s: float = 2.0
     settle_s: float = 60.0
 
@@ -170,9 +168,8 @@ class _Run:
                 "slurm_partition": array.partition,
                 "slurm_account": array.account,
                 "slurm_array_parallelism": self.workers,
-                "slurm_additional_parameters": dict(array.extra),
             }
-        return {name: value for name, value in parameters.items() if value not in (None, {}) or name == "timeout_min"}
+        return {name: value for name, value in parameters.items() if value is not None}
 
 
 @dataclass(frozen=True)

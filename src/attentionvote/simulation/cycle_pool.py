@@ -1,24 +1,44 @@
-"""Runs the drop cycles of a scene set, in this process or in several, with a progress bar."""
+"""Runs the drop cycles of a scene set, here, in several processes or on several machines, with a progress bar.
+
+Workers simulate, this process stores: a cycle is a few kilobytes, so no worker needs the set's directory, and nothing
+is written twice or by two.
+"""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+from attentionvote.execution import Executor, WorkerDied, run_all
 from attentionvote.part import Part
 from attentionvote.simulation.decomposition import Hulls
 from attentionvote.simulation.raycast import PartCaster
-from attentionvote.simulation.scene_set import write_cycle
+from attentionvote.simulation.scene_record import SceneRecord
+from attentionvote.simulation.scene_set import simulate_cycle, store_cycle
 from attentionvote.simulation.scene_spec import SceneSetSpec
 
-_job: tuple[Part, Hulls, PartCaster, SceneSetSpec, Path] | None = None  # of a worker process
+
+@dataclass(frozen=True)
+class CycleTask:
+    """Simulates a cycle; a worker builds the ray caster for its first one."""
+
+    part: Part
+    hulls: Hulls
+    spec: SceneSetSpec
+
+    def __call__(self, cycle: int) -> list[SceneRecord]:
+        """The scenes of a cycle."""
+        return simulate_cycle(self.part, self.hulls, self._caster, self.spec, cycle)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_caster"}
+
+    @cached_property
+    def _caster(self) -> PartCaster:
+        return PartCaster(self.part)
 
 
 def run_cycles(
@@ -31,17 +51,16 @@ def run_cycles(
     progress: bool,
     title: str,
     done: int = 0,
+    executor: Executor | None = None,
 ) -> None:
     """Simulate and store ``cycles``; ``done`` of the set were there before.
 
     Raises:
-        OSError: when a worker process died.
+        OSError: when the worker of one cycle died again and again.
     """
     if not cycles:
         return
-    workers = min(workers, len(cycles))
-    run = _in_this_process if workers == 1 else _in_processes
-    scene_counts = run(part, hulls, spec, directory, cycles, workers)
+    scene_counts = _stored(CycleTask(part, hulls, spec), directory, cycles, workers, executor)
     if not progress:
         for _ in scene_counts:
             pass
@@ -73,56 +92,17 @@ def run_cycles(
             bar.update(task, advance=1, scenes=scenes)
 
 
-def _in_this_process(
-    part: Part, hulls: Hulls, spec: SceneSetSpec, directory: Path, cycles: Sequence[int], _workers: int
+def _stored(
+    task: CycleTask, directory: Path, cycles: Sequence[int], workers: int, executor: Executor | None
 ) -> Iterator[int]:
-    caster = PartCaster(part)
-    for cycle in cycles:
-        yield write_cycle(part, hulls, caster, spec, directory, cycle)
-
-
-def _in_processes(
-    part: Part, hulls: Hulls, spec: SceneSetSpec, directory: Path, cycles: Sequence[int], workers: int
-) -> Iterator[int]:
-    before = multiprocessing.active_children()
-    pool = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), _start_worker, (part, hulls, spec, directory)
-    )
-    futures: list[Future[int]] = []
-    finished = False
+    """Store every cycle as it comes; yields the number of its scenes."""
     try:
-        futures = [pool.submit(_work, cycle) for cycle in cycles]
-        for future in as_completed(futures):
-            yield future.result()
-        finished = True
-    except BrokenProcessPool as error:
-        kept = sum(f.done() and not f.exception() for f in futures)
+        with closing(run_all(task, cycles, executor, workers=workers)) as results:
+            for index, records in results:
+                store_cycle(directory, cycles[index], records)
+                yield len(records)
+    except WorkerDied as error:
         raise OSError(
-            f"a worker process died (out of memory?) after {kept} of {len(cycles)} cycles; they are kept, "
-            "start again to go on"
+            f"a worker process died (out of memory? {error.how}) {error.times} times at cycle {cycles[error.job]} "
+            f"after {error.finished} of {len(cycles)} cycles; they are kept, start again to go on"
         ) from error
-    finally:
-        if not finished:  # Ctrl-C or an error: what runs now is lost, what is stored stays
-            for child in set(multiprocessing.active_children()) - set(before):
-                child.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _start_worker(part: Part, hulls: Hulls, spec: SceneSetSpec, directory: Path) -> None:
-    global _job
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    _job = (part, hulls, PartCaster(part), spec, directory)
-
-
-def _die_with_parent() -> None:
-    """End this worker when its parent is gone, also after kill -9."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-
-def _work(cycle: int) -> int:
-    assert _job is not None
-    return write_cycle(*_job, cycle)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from attentionvote.execution import Executor
 from attentionvote.part import Part
 from attentionvote.simulation.decomposition import Hulls, convex_hulls
 from attentionvote.simulation.drop import drop_parts
@@ -117,7 +118,12 @@ def simulate_cycle(part: Part, hulls: Hulls, caster: PartCaster, spec: SceneSetS
 
 
 def generate_scene_set(
-    part: Part, spec: SceneSetSpec, directory: Path, workers: int = 1, progress: bool = True
+    part: Part,
+    spec: SceneSetSpec,
+    directory: Path,
+    workers: int = 1,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> SceneSet:
     """Generate what is missing of a scene set and open it; does nothing when it is complete.
 
@@ -127,10 +133,12 @@ def generate_scene_set(
         directory: the set's own directory, created when missing; a second process waits for the first.
         workers: processes; the result does not depend on it.
         progress: show a progress bar with the time left on stderr.
+        executor: where the workers are; default this machine. Nor does the result depend on it.
 
     Raises:
-        ValueError: when the directory holds another set or the part is another one.
-        OSError: when a worker process died; what is finished is kept and the next call goes on from there.
+        ValueError: when the directory holds another set or the part is another one, or the executor cannot work here.
+        OSError: when the worker of one cycle died again and again; what is finished is kept and the next call goes on
+            from there.
     """
     from attentionvote.simulation.cycle_pool import run_cycles
 
@@ -157,7 +165,8 @@ def generate_scene_set(
             hulls = _frozen_hulls(part, spec, directory)
             missing = [c for c in range(spec.cycles) if not _shard(directory, c).is_file()]
             title = f"{part.name}, {spec.split} scenes"
-            run_cycles(part, hulls, spec, directory, missing, workers, progress, title, done=spec.cycles - len(missing))
+            done = spec.cycles - len(missing)
+            run_cycles(part, hulls, spec, directory, missing, workers, progress, title, done, executor)
             _write_manifest(directory, part, spec, content_digest(directory, spec.cycles))
     return SceneSet.open(directory)
 
@@ -182,11 +191,9 @@ def content_digest(directory: Path, cycles: int) -> str:
     return h.hexdigest()
 
 
-def write_cycle(part: Part, hulls: Hulls, caster: PartCaster, spec: SceneSetSpec, directory: Path, cycle: int) -> int:
-    """Simulate one cycle and store it; the number of its scenes."""
-    records = simulate_cycle(part, hulls, caster, spec, cycle)
+def store_cycle(directory: Path, cycle: int, records: list[SceneRecord]) -> None:
+    """Store the scenes of one cycle."""
     save_records(_shard(directory, cycle), records)
-    return len(records)
 
 
 def _shard(directory: Path, cycle: int) -> Path:
