@@ -27,7 +27,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     with configuring():
         versions = Versions(cfg.tracking.store, cfg.object.name)
         history = History(versions)
-        standing = stand(versions, history)
+        standing = stand(versions, history, carry_out=False)
         events = history.events()
     counted = {event.number for event in counting(events)}
     table = Table(title=versions.name, title_justify="left", box=None, pad_edge=False)
@@ -57,8 +57,8 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     if events:
         Console(stderr=True).print(table)
     log.info("%s: %s", versions.name, f"the champion is version {champion}" if champion else "there is no champion")
-    if standing.by_hand:
-        log.warning("%s", standing.by_hand)
+    if standing.astray:
+        log.warning("%s", standing.astray)
     return {"stage": "history", "object": cfg.object.name, "model": versions.name, "champion": champion, "events": rows}
 
 

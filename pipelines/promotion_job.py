@@ -52,8 +52,8 @@ class PromotionJob:
         versions = Versions(cfg.tracking.store, evaluation.part.name)
         history = History(versions)
         standing = stand(versions, history)
-        if standing.by_hand:
-            log.warning("%s", standing.by_hand)
+        if standing.astray:
+            log.warning("%s", standing.astray)
         return cls(evaluation, rules, versions, history, standing, cfg.why)
 
     def already(self) -> dict[str, Any] | None:

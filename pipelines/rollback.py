@@ -32,8 +32,8 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         versions = Versions(cfg.tracking.store, cfg.object.name)
         history = History(versions)
         standing = stand(versions, history)
-        if standing.by_hand:
-            log.warning("%s", standing.by_hand)
+        if standing.astray:
+            log.warning("%s", standing.astray)
         version = target(versions, standing, cfg.to)
         with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
             load_bundle(versions.fetch(version, Path(folder)), key)

@@ -24,7 +24,7 @@ def test_a_promotion_moves_the_alias_and_is_told(versions, history, three):
     assert (event.version, event.before, event.base) == (2, 1, 1)
     assert [e.done for e in history.events()] == [True, True]
     standing = stand(versions, history)
-    assert (standing.champion, standing.previous, standing.ever, standing.by_hand) == (three[1], (1,), (1, 2), "")
+    assert (standing.champion, standing.previous, standing.ever, standing.astray) == (three[1], (1,), (1, 2), "")
 
 
 def test_of_two_promotions_at_once_one_wins_and_the_other_is_told(versions, history, three):
@@ -88,9 +88,13 @@ def test_a_decision_without_its_move_is_carried_out_by_whoever_comes_next(versio
     promote(versions, history, three[0])
     # What a process leaves that is killed between the history and the alias.
     history.append("promote", 2, 1, three[1].digest, 1, "killed")
-    assert versions.champion() == three[0]
+    onlooker = stand(versions, history, carry_out=False)
+    assert onlooker.champion == versions.champion() == three[0]
+    assert onlooker.astray.startswith("the promote of version 2 by ")
+    assert onlooker.astray.endswith("was decided but not carried out: `make promote` or `make rollback` does it")
     assert stand(versions, history).champion == three[1]
     assert versions.champion() == three[1]
+    assert stand(versions, history, carry_out=False).astray == ""
     assert all(e.done for e in history.events())
 
 
@@ -106,7 +110,7 @@ def test_a_champion_that_was_moved_by_hand_is_reported_and_counts(versions, hist
     versions.set_champion(three[2])
     standing = stand(versions, history)
     assert standing.champion == three[2]
-    assert standing.by_hand == (
+    assert standing.astray == (
         "the champion must be version 1 by the history, but it is version 3: it was changed by hand"
     )
     assert target(versions, standing, None).number == 1
@@ -118,7 +122,7 @@ def test_a_deleted_champion_can_be_rolled_back_and_the_story_stays(versions, his
     versions.client.delete_model_version(versions.name, "2")
     standing = stand(versions, history)
     assert standing.champion is None
-    assert "there is none (was the version deleted?)" in standing.by_hand
+    assert "there is none (was the version deleted?)" in standing.astray
     version = target(versions, standing, None)
     move(versions, history, standing, "rollback", version, "deleted")
     assert versions.champion().number == 1

@@ -39,8 +39,9 @@ def test_a_deleted_champion_is_no_champion(versions, make_model):
     assert versions.champion() is None
 
 
-def test_artefacts_that_are_gone_are_said(versions, make_model, tmp_path):
-    version = versions.register(make_model(), {})
+def test_artefacts_that_are_gone_are_said_and_registered_anew(versions, make_model, trusted_key, tmp_path):
+    bundle = make_model()
+    version = versions.register(bundle, {})
     (model,) = (
         (tmp_path / "outputs").rglob("model.onnx") if _is_database(versions) else tmp_path.rglob("m-*/**/model.onnx")
     )
@@ -49,6 +50,10 @@ def test_artefacts_that_are_gone_are_said(versions, make_model, tmp_path):
     model.parent.rmdir()
     with pytest.raises(ValueError, match="the artefacts of attentionvote-bracket must be in the store"):
         versions.fetch(version, tmp_path / "fetched")
+    # The bundle is still on this machine: it becomes a version that can be fetched.
+    again = versions.register(bundle, {})
+    assert again.number == 2
+    assert load_bundle(versions.fetch(again, tmp_path / "fetched"), trusted_key).digest == bundle.digest
 
 
 def _is_database(versions) -> bool:

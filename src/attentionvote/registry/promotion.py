@@ -30,21 +30,27 @@ class Standing:
         base: number of the last move, which the next one must name.
         previous: version numbers that a rollback would come to, the next one last.
         ever: version numbers that have been champion, oldest first.
-        by_hand: a sentence when the alias is not where the history left it; empty otherwise.
+        astray: a sentence when the alias is not where the history left it; empty otherwise.
     """
 
     champion: Version | None
     base: int
     previous: tuple[int, ...]
     ever: tuple[int, ...]
-    by_hand: str = ""
+    astray: str = ""
 
 
-def stand(versions: Versions, history: History) -> Standing:
-    """Read where the champion stands; a move that was decided but not carried out is carried out first."""
+def stand(versions: Versions, history: History, carry_out: bool = True) -> Standing:
+    """Read where the champion stands.
+
+    Args:
+        versions, history: of the part's model.
+        carry_out: whether a move that was decided, but not carried out, is carried out first.
+    """
     moves = counting(history.events())
     existing = {version.number: version for version in versions.all()}
-    if moves and not moves[-1].done:
+    unfinished = bool(moves) and not moves[-1].done
+    if unfinished and carry_out:
         if moves[-1].version in existing:
             log.warning("the %s was decided but not carried out: the champion is moved now", told(moves[-1]))
             versions.set_champion(existing[moves[-1].version])
@@ -60,16 +66,18 @@ def stand(versions: Versions, history: History) -> Standing:
         stack.append(move.version)
     now = None if champion is None else champion.number
     previous = tuple(number for number in stack if number in existing and number != now)
-    by_hand = ""
+    astray = ""
     if moves and now != moves[-1].version:
         got = "there is none (was the version deleted?)" if now is None else f"it is version {now}"
-        by_hand = f"the champion must be version {moves[-1].version} by the history, but {got}: it was changed by hand"
+        astray = f"the champion must be version {moves[-1].version} by the history, but {got}: it was changed by hand"
+        if unfinished and not carry_out:
+            astray = f"the {told(moves[-1])} was decided but not carried out: `make promote` or `make rollback` does it"
     return Standing(
         champion,
         moves[-1].number if moves else 0,
         previous,
         tuple(dict.fromkeys(move.version for move in moves)),
-        by_hand,
+        astray,
     )
 
 

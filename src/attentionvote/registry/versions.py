@@ -8,6 +8,7 @@ that cells follow.
 from __future__ import annotations
 
 import contextlib
+import logging
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from attentionvote.tracking.store import connect, experiment_id, resolve_store
 if TYPE_CHECKING:
     from mlflow.entities.model_registry import ModelVersion
 
+log = logging.getLogger(__name__)
 PREFIX = "attentionvote-"
 CHAMPION, CANDIDATE = "champion", "candidate"
 DIGEST_TAG = "bundle.digest"
@@ -95,7 +97,7 @@ class Versions:
             OSError: when what the store gives back is not what it got.
         """
         known = self.of_bundle(bundle.digest)
-        if known is not None:
+        if known is not None and self._is_whole(known):
             self.tag(known, tags)
             return known
         run = self._run(bundle.card.run_id)
@@ -173,6 +175,17 @@ class Versions:
             return self.client.get_run(run_id)
         except MlflowException:
             return None
+
+    def _is_whole(self, version: Version) -> bool:
+        """Whether a version's artefacts are still the bundle it was registered as."""
+        location = self.client.get_model_version_download_uri(self.name, str(version.number))
+        try:
+            with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
+                self._check(version.digest, location, Path(folder))
+        except (OSError, ValueError) as error:
+            log.warning("version %d is registered anew: %s", version.number, error)
+            return False
+        return True
 
     def _check(self, digest: str, location: str, folder: Path) -> None:
         """What was stored must be the bundle, bit by bit: a proxy, a full disk or another version may interfere."""
