@@ -52,8 +52,11 @@ def resolve_store(store: str | None) -> str:
         if path == store or not path:
             raise ValueError(f"an SQLite tracking store must read sqlite:///PATH.db, got {store!r}")
         return f"sqlite:///{Path(path).expanduser().absolute()}"
-    if scheme in SERVERS or scheme in DATABASES:
-        return store.rstrip("/") if scheme in SERVERS else store
+    if scheme in SERVERS:
+        return store.rstrip("/")
+    if scheme in DATABASES:
+        # SQLAlchemy's own choice is psycopg 3, which nothing here installs.
+        return re.sub("^postgresql://", "postgresql+psycopg2://", store)
     if scheme in ("file", ""):
         raise ValueError(
             f"tracking store must be an SQLite file or a server, because MLflow no longer writes folders; "
