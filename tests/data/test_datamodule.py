@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from attentionvote.data import Augmentation, Batch, Clouds, CloudSettings, PartDataModule, measure_clouds
-from attentionvote.data.datamodule import EpochSampler
+from attentionvote.data.datamodule import EpochSampler, scene_share
 from attentionvote.model import Layout
 from attentionvote.part import Part
 from attentionvote.simulation import SceneSet
@@ -95,3 +95,43 @@ def test_what_cannot_be_trained_on_is_refused(
         PartDataModule(clouds, empty, clouds, 64, layout, 2, 0, Augmentation(), 0)
     mixed = measure_clouds(make_scenes((1, 2)), box, settings, folder, 1, progress=False)
     assert len(PartDataModule(mixed, clouds, clouds, 64, layout, 2, 0, Augmentation(), 0).train) == 2
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 6])
+def test_the_shares_of_all_processes_are_the_batches_of_one(processes: int) -> None:
+    whole = EpochSampler(32, 5, batch_size=6)
+    shares = [EpochSampler(32, 5, 6, rank, processes) for rank in range(processes)]
+    for epoch in (0, 3):
+        for sampler in (whole, *shares):
+            sampler.set_epoch(epoch)
+        one, parts = list(whole), [list(share) for share in shares]
+        assert len(one) == len(whole) == 30  # five whole batches; the rest is left out, as in one process
+        assert {len(part) for part in parts} == {len(shares[0])} == {30 // processes}
+        size = 6 // processes
+        for step in range(5):
+            batch = [item for part in parts for item in part[step * size : (step + 1) * size]]
+            assert batch == one[6 * step : 6 * step + 6]
+
+
+def test_a_process_draws_the_same_samples_as_one_alone(clouds: Clouds, layout: Layout) -> None:
+    def of(rank: int, processes: int) -> PartDataModule:
+        return PartDataModule(clouds, clouds, clouds, 64, layout, 4, 0, Augmentation(), 3, rank, processes)
+
+    (whole,) = points(of(0, 1), 2)
+    parts = [points(of(rank, 2), 2) for rank in range(2)]
+    assert torch.equal(torch.cat([part[0] for part in parts]), whole)
+    validated = [[batch.points for batch in of(rank, 2).val_dataloader()] for rank in range(2)]
+    alone = torch.cat([batch.points for batch in of(0, 1).val_dataloader()])
+    assert torch.equal(torch.cat([p for part in validated for p in part]), alone)  # five scenes: 3 and 2
+    with pytest.raises(ValueError, match="processes must be at most the 5 training scenes, got 6"):
+        PartDataModule(clouds, clouds, clouds, 64, layout, 5, 0, Augmentation(), 3, 0, 6)
+    with pytest.raises(ValueError, match="batch_size must be a multiple of the 2 processes, got 3"):
+        PartDataModule(clouds, clouds, clouds, 64, layout, 3, 0, Augmentation(), 3, 0, 2)
+
+
+@pytest.mark.parametrize(("size", "processes"), [(1, 1), (5, 2), (7, 3), (8, 4), (9, 8)])
+def test_every_scene_is_looked_at_by_one_process(size: int, processes: int) -> None:
+    shares = [scene_share(size, rank, processes) for rank in range(processes)]
+    assert [scene for share in shares for scene in share] == list(range(size))
+    assert all(shares)  # Lightning does not validate where there is nothing: the others would wait for ever
+    assert len(shares[0]) == max(map(len, shares))

@@ -172,7 +172,7 @@ class AttentionVoteLoss:
         if not self.settings.one_per_instance:
             return quality
         key = assigned.sample * batch.visible.shape[1] + assigned.instance
-        best = torch.full((int(batch.visible.numel()),), torch.inf, device=distance.device)
+        best = torch.full((int(batch.visible.numel()),), torch.inf, dtype=distance.dtype, device=distance.device)
         best = best.scatter_reduce(0, key, distance, "amin")
         return quality * (distance <= best[key])
 
