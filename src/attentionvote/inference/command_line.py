@@ -1,4 +1,4 @@
-"""``attentionvote`` on a cell's command line: estimate a file, verify a bundle, serve it, ask its health, make keys.
+"""``attentionvote`` on a cell's command line: estimate a file, verify a bundle, fetch one, serve it, make keys.
 
 Results go to stdout, everything else to stderr as one sentence. Exit codes: 0 done, 1 the bundle or the machine is at
 fault, 2 the input or the command is, 130 interrupted. Heavy imports stand where they are used: ``--help`` is instant.
@@ -99,6 +99,13 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
         health.add_arguments(verb)
         verb.set_defaults(run=health.run)
+
+    verb = verbs.add_parser("fetch", help="fetch a bundle from a registry", description="Fetch a bundle, verify it.")
+    if words[:1] == ["fetch"]:
+        from attentionvote.inference import fetch_command
+
+        fetch_command.add_arguments(verb)
+        verb.set_defaults(run=fetch_command.run)
 
     verb = verbs.add_parser("keys", help="make the key pair that signs bundles", description=_keys.__doc__)
     verb.add_argument("--folder", metavar="PATH", help="default: $ATTENTIONVOTE_KEYS or ~/.config/attentionvote")

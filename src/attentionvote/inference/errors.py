@@ -13,3 +13,15 @@ class BundleError(ValueError):
 
 class DeadlineExceeded(TimeoutError):
     """The work was stopped because its deadline had passed."""
+
+
+class RegistryError(BundleError):
+    """The registry gives no usable answer: it is away, refuses, or does not have what it is asked for (exit code 1).
+
+    Attributes:
+        away: whether asking again later may help: nothing answers, or it is overloaded.
+    """
+
+    def __init__(self, sentence: str, *, away: bool = False) -> None:
+        super().__init__(sentence)
+        self.away = away

@@ -25,9 +25,9 @@ from attentionvote.inference.server.access import Tokens
 from attentionvote.inference.server.answering import Answering, Question
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.protocol_routes import ProtocolRoutes
+from attentionvote.inference.server.protocol_routes import ProtocolRoutes, registered
 from attentionvote.inference.server.refusal import Refusal, bad_request, nearest
-from attentionvote.inference.server.reloading import BundleWatch
+from attentionvote.inference.server.reloading import Watch
 from attentionvote.inference.server.request_log import RequestLog
 
 DOCUMENTATION = "docs/operating-a-cell.md"
@@ -38,7 +38,7 @@ _PATHS = (
 
 
 def application(
-    answering: Answering, watch: BundleWatch, metrics: Metrics, cell: Cell, tokens: Tokens | None, version: str
+    answering: Answering, watch: Watch, metrics: Metrics, cell: Cell, tokens: Tokens | None, version: str
 ) -> Starlette:
     """The ASGI application.
 
@@ -91,6 +91,7 @@ class _Pages:
         if served is not None:
             part = asdict(served.card.part)
             model = {"name": served.name, "version": served.version, "digest": served.digest, "part": part}
+            model |= registered(served)
         content = {
             "name": "attentionvote",
             "version": self._version,

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from attentionvote.inference.answer import DIGEST_LENGTH
 from attentionvote.inference.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.estimator import PoseEstimator
 from attentionvote.inference.golden import self_test
 from attentionvote.inference.manifest import MANIFEST, MOST_MANIFEST_BYTES, files_in, opened, read_file
+from attentionvote.inference.registry_reference import RegistryVersion
 from attentionvote.inference.server.last_known_good import LastKnownGood
 from attentionvote.inference.server.serving import Served
 
@@ -55,11 +57,14 @@ class BundleLoader:
         trusted: the key that must have signed a bundle.
         make_estimator: of a verified bundle.
         store: where what served well is kept; None when it cannot be kept anywhere.
+        origin_of: the registry's version that a digest is, where bundles come from a registry; what has none may not
+            serve. None where they come from a path.
     """
 
     trusted: Trusted
     make_estimator: Callable[[Bundle], PoseEstimator]
     store: LastKnownGood | None
+    origin_of: Callable[[str], RegistryVersion | None] | None = None
 
     def tested(self, folder: Path) -> tuple[Bundle, PoseEstimator]:
         """A verified bundle and an estimator that reproduced every golden cloud of it.
@@ -68,6 +73,11 @@ class BundleLoader:
             BundleError: with the first thing that is wrong.
         """
         bundle = load_bundle(folder, self.trusted)
+        if self.origin_of is not None and self.origin_of(bundle.digest) is None:
+            raise BundleError(
+                f"{folder} must hold a bundle that the registry named, got {bundle.digest[:DIGEST_LENGTH]}, which it "
+                "did not under this reference"
+            )
         estimator = self.make_estimator(bundle)
         problems = self_test(estimator, bundle)
         if problems:
@@ -97,7 +107,8 @@ class BundleLoader:
                 estimator.close()
                 raise
             failure = error
-        return Served(estimator, self.store is not None and failure is None, last_known_good=False), failure
+        kept = self.store is not None and failure is None
+        return Served(estimator, kept, last_known_good=False, origin=self._origin(bundle)), failure
 
     def keep(self, source: Path, digest: str) -> bool:
         """Keep a bundle that serves already; False when the path holds another by now.
@@ -117,9 +128,12 @@ class BundleLoader:
         problems = []
         for entry in self.store.entries() if self.store is not None else []:
             try:
-                _, estimator = self.tested(entry)
+                bundle, estimator = self.tested(entry)
             except (BundleError, OSError) as error:
                 problems.append(str(error))
             else:
-                return Served(estimator, kept=True, last_known_good=True), problems
+                return Served(estimator, kept=True, last_known_good=True, origin=self._origin(bundle)), problems
         return None, problems
+
+    def _origin(self, bundle: Bundle) -> RegistryVersion | None:
+        return None if self.origin_of is None else self.origin_of(bundle.digest)

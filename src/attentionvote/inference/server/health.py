@@ -46,7 +46,9 @@ def run(options: argparse.Namespace) -> int:
     try:
         with opener.open(address, timeout=options.timeout_s) as response:
             content = json.loads(response.read(_MOST_BYTES))
-        print(f"ready: {content['model']} {content['version']}")
+        origin = content.get("registry")
+        said = f", version {origin['version']} of {origin['name']}" if origin else ""
+        print(f"ready: {content['model']} {content['version']}{said}")
         return 0
     except urllib.error.HTTPError as error:
         print(f"health: not ready ({error.code}): {_sentence(error.read(_MOST_BYTES))}", file=sys.stderr)

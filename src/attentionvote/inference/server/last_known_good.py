@@ -22,23 +22,29 @@ from attentionvote.inference.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.durable import sync
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.manifest import MANIFEST, SIGNATURE, files_in, most_bytes, opened, read_file
+from attentionvote.inference.registry_reference import SCHEME, Reference
 
 STATE_VARIABLE = "ATTENTIONVOTE_STATE"
 KEPT = 2
 _NAME = re.compile(r"(\d{8})-([0-9a-f]{12})")
 
 
-def default_state(source: Path) -> Path:
-    """The state folder of a served path: one folder a path, below ``ATTENTIONVOTE_STATE``.
+def default_state(source: Path | Reference) -> Path:
+    """The state folder of a served path or reference: one folder each, below ``ATTENTIONVOTE_STATE``.
 
     Without the variable they lie below ``~/.local/state/attentionvote``. The name follows the path as it was given,
     links unresolved, because that is what stays the same when the bundle behind it changes.
     """
     named = os.environ.get(STATE_VARIABLE)
     root = Path(named).expanduser() if named else Path.home() / ".local" / "state" / "attentionvote"
-    absolute = os.path.abspath(source)
+    if isinstance(source, Reference):  # wherever the server is started from
+        absolute = str(source)
+        name = absolute.removeprefix(SCHEME)
+    else:
+        absolute = os.path.abspath(source)
+        name = os.path.basename(absolute)
     key = hashlib.sha256(os.fsencode(absolute)).hexdigest()[:8]
-    stem = re.sub(r"[^A-Za-z0-9._-]", "_", os.path.basename(absolute))[:40] or "bundle"
+    stem = re.sub(r"[^A-Za-z0-9._-]", "_", name)[:40] or "bundle"
     return root / f"{stem}-{key}"
 
 

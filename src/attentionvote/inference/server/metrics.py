@@ -10,11 +10,14 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from attentionvote.inference.registry_reference import RegistryVersion
+
 OUTCOMES = ("ok", "abstained", "rejected", "unauthorized", "overloaded", "unavailable", "deadline", "gone", "failed")
 STAGES = ("receive", "parse", "queue", "estimate", "total")
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0)
 DETECTIONS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
 RELOADS = ("loaded", "refused", "failed", "last_known_good")
+POLLS = ("answered", "away", "refused", "failed")
 ABSTENTIONS = ("too_few_points", "nothing_found", "deadline_exceeded")
 
 
@@ -64,6 +67,20 @@ class Metrics:
             prefix + "last_known_good_kept", "1 when the model that serves is also kept on disk for the next start",
             registry=self.registry,
         )  # fmt: skip
+        self.registered_as = Gauge(
+            prefix + "registry_info", "The registered version that serves", ["name", "version", "digest"],
+            registry=self.registry,
+        )  # fmt: skip
+        self.registry_polls = Counter(
+            prefix + "registry_polls", "Questions to the registry by outcome", ["outcome"], registry=self.registry
+        )
+        self.registry_error = Gauge(
+            prefix + "registry_error_info", "Why what the registry names does not serve", ["error"],
+            registry=self.registry,
+        )  # fmt: skip
+        self.registry_failing = Gauge(
+            prefix + "registry_failing", "1 while the registry cannot be followed", registry=self.registry
+        )
         self.registry.register(_Memory())
         for outcome in OUTCOMES:
             self.requests.labels(outcome)
@@ -71,6 +88,8 @@ class Metrics:
             self.seconds.labels(stage)
         for reason in ABSTENTIONS:
             self.abstentions.labels(reason)
+        for outcome in POLLS:
+            self.registry_polls.labels(outcome)
         for outcome in RELOADS:
             self.reloads.labels(outcome)
 
@@ -87,6 +106,19 @@ class Metrics:
         self.reload_failing.set(sentence is not None)
         if sentence is not None:
             self.reload_error.labels(sentence).set(1)
+
+    def registered(self, version: RegistryVersion | None) -> None:
+        """Say which registered version serves from now on; None when it comes from a path."""
+        self.registered_as.clear()
+        if version is not None:
+            self.registered_as.labels(version.name, version.version, version.digest).set(1)
+
+    def registry_problem(self, sentence: str | None) -> None:
+        """Say why the registry cannot be followed; None when it can."""
+        self.registry_error.clear()
+        self.registry_failing.set(sentence is not None)
+        if sentence is not None:
+            self.registry_error.labels(sentence).set(1)
 
     def text(self) -> bytes:
         """The exposition in Prometheus' text format."""

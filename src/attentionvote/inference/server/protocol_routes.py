@@ -22,7 +22,8 @@ from attentionvote.inference.server.protocol_answer import (
 )
 from attentionvote.inference.server.protocol_request import InferRequest, parse_request
 from attentionvote.inference.server.refusal import Refusal
-from attentionvote.inference.server.reloading import BundleWatch
+from attentionvote.inference.server.reloading import Watch
+from attentionvote.inference.server.serving import Served
 
 LENGTH_HEADER = "Inference-Header-Content-Length"
 _MOST_INDEX_BYTES, _INDEX_S = 4096, 5.0
@@ -37,7 +38,7 @@ class ProtocolRoutes:
         version: of the server.
     """
 
-    def __init__(self, answering: Answering, watch: BundleWatch, version: str) -> None:
+    def __init__(self, answering: Answering, watch: Watch, version: str) -> None:
         self._answering, self._serving, self._watch, self._version = answering, answering.serving, watch, version
 
     def routes(self) -> list[Route]:
@@ -63,7 +64,8 @@ class ProtocolRoutes:
 
     async def _ready(self, _: Request) -> Response:
         served = self._serving.model()
-        return JSONResponse({"ready": True, "model": served.name, "version": served.version})
+        content = {"ready": True, "model": served.name, "version": served.version}
+        return JSONResponse(content | registered(served))
 
     async def _model(self, request: Request) -> Response:
         served = self._serving.model(**request.path_params)
@@ -95,7 +97,8 @@ class ProtocolRoutes:
         models: list[dict[str, Any]] = []
         if served is not None:
             reason = self._watch.problem or ""
-            models.append({"name": served.name, "version": served.version, "state": "READY", "reason": reason})
+            model = {"name": served.name, "version": served.version, "state": "READY", "reason": reason}
+            models.append(model | registered(served))
         return JSONResponse(models)
 
     async def _load(self, request: Request) -> Response:
@@ -106,6 +109,13 @@ class ProtocolRoutes:
             raise Refusal(409, problem, "rejected")
         served = self._serving.model()
         return JSONResponse({"name": served.name, "version": served.version, "state": "READY"})
+
+
+def registered(served: Served) -> dict[str, Any]:
+    """``{"registry": {"name": ..., "version": ...}}`` of a model from a registry, else nothing."""
+    if served.origin is None:
+        return {}
+    return {"registry": {"name": served.origin.name, "version": served.origin.version}}
 
 
 def _encoded(reply: Reply) -> tuple[bytes, int | None]:

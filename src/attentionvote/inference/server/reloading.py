@@ -16,7 +16,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.server.bundle_loading import BundleLoader, Mark, mark_of
@@ -28,6 +28,23 @@ T = TypeVar("T")
 _FIRST_RETRY_S, _LAST_RETRY_S = 2.0, 300.0  # the same bundle again: disks get free, networks come back
 # Threads of this politeness leave the processor to requests: a self-test costs as much as several of them.
 _NICE = 5
+
+
+class Watch(Protocol):
+    """What the application asks of whatever keeps the model up to date."""
+
+    @property
+    def problem(self) -> str | None:
+        """Why what should serve does not; None: it does."""
+
+    async def run(self) -> None:
+        """Keep it up to date until cancelled."""
+
+    async def check(self) -> str | None:
+        """Look now, and say why it does not serve (None: it does)."""
+
+    def close(self) -> None:
+        """Begin nothing more."""
 
 
 class BundleWatch:
@@ -53,12 +70,14 @@ class BundleWatch:
         patience_s: float = 10.0,
     ) -> None:
         self.problem: str | None = None
+        # Asked why the path holds nothing yet, where somebody fills it and knows better.
+        self.explain: Callable[[], str | None] = lambda: None
         self._source, self._loader, self._serving, self._metrics = source, loader, serving, metrics
         self._poll_s, self._patience_s = poll_s, patience_s
         self._tried: Mark | None = None
         self._retry_s, self._retry_at = _FIRST_RETRY_S, 0.0
         self._lock = asyncio.Lock()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reload", initializer=_be_polite)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reload", initializer=be_polite)
 
     async def run(self) -> None:
         """Load the first model, then watch until cancelled."""
@@ -146,7 +165,8 @@ class BundleWatch:
         for problem in problems:
             say("last_known_good", f"a kept copy cannot serve: {problem}", logging.ERROR)
         if served is None:
-            self._serving.waits_for = f"{self.problem}, and there is no last known good copy to start from"
+            reason = self.explain() or self.problem
+            self._serving.waits_for = f"{reason}, and there is no last known good copy to start from"
             say("waiting", self._serving.waits_for, logging.ERROR)
         elif self._serving.current is None:
             self._metrics.reloads.labels("last_known_good").inc()
@@ -174,13 +194,14 @@ class BundleWatch:
         self.problem = sentence
         self._metrics.reload_problem(sentence)
         if serves is None:
-            self._serving.waits_for = sentence
+            self._serving.waits_for = self.explain() or sentence
 
     async def _blocking(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, lambda: work(*arguments, **named))
 
 
-def _be_polite() -> None:
+def be_polite() -> None:
+    """Let this thread give way to requests."""
     thread = threading.get_native_id()  # Linux schedules threads like processes
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19))

@@ -1,4 +1,4 @@
-"""``attentionvote serve BUNDLE``: checks what it was given, binds, serves, and ends in order on SIGTERM or Ctrl-C."""
+"""``attentionvote serve BUNDLE|MODEL``: checks what it was given, serves, and ends in order on SIGTERM or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ from pathlib import Path
 
 import uvicorn
 
+from attentionvote.inference import registry_access
 from attentionvote.inference.bundle import Bundle
 from attentionvote.inference.cell import Cell, read_cell
 from attentionvote.inference.errors import BundleError, InputError
 from attentionvote.inference.estimator import PoseEstimator
+from attentionvote.inference.fetched_bundles import FetchedBundles
 from attentionvote.inference.server.access import Tokens, check_host
 from attentionvote.inference.server.admission import MOST_DEADLINE_MS, Gate
 from attentionvote.inference.server.answering import Answering, Limits
@@ -30,8 +32,8 @@ from attentionvote.inference.server.bundle_loading import BundleLoader
 from attentionvote.inference.server.json_logs import configure, say
 from attentionvote.inference.server.last_known_good import STATE_VARIABLE, LastKnownGood, default_state
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.reloading import BundleWatch
 from attentionvote.inference.server.serving import Serving
+from attentionvote.inference.server.source import Source, source_of
 from attentionvote.inference.signature import PUBLIC_NAME, keys_folder, load_public_key
 
 PORT = 8000
@@ -45,7 +47,11 @@ _MEBIBYTE = 1024 * 1024
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's arguments."""
     add = parser.add_argument
-    add("bundle", type=Path, help="a bundle's folder, or a link to one: another bundle there is taken up while serving")
+    add(
+        "bundle",
+        help="a bundle's folder, or a link to one: another bundle there is taken up while serving; or "
+        "models:/NAME@ALIAS in a registry, which is followed, or models:/NAME/VERSION, which is pinned",
+    )
     add("--key", type=Path, help=f"public key that must have signed it (default: {PUBLIC_NAME} in the keys' folder)")
     add("--host", default="127.0.0.1", help="address to listen on; others than loopback need --token-file")
     add("--port", type=int, default=PORT, help=f"default {PORT}; 0 picks a free one")
@@ -59,6 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--deadline-ms", type=float, default=2000.0, help="of requests that name none, default 2000")
     add("--max-body-mb", type=float, default=64.0, help="largest request body in MiB, default 64")
     add("--poll-s", type=float, default=2.0, help="seconds between two looks at the bundle's path, default 2")
+    registry_access.add_arguments(parser)
+    add("--registry-poll-s", type=float, default=10.0, help="seconds between two questions to the registry, default 10")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -92,6 +100,8 @@ class _Settings:
     """What the options came to; ``problem`` is why nothing can be kept for the next start."""
 
     problem: str
+    source: Source
+    bundles: FetchedBundles | None
     loader: BundleLoader
     cell: Cell
     tokens: Tokens | None
@@ -110,6 +120,8 @@ def _checked(options: argparse.Namespace) -> _Settings:
     _check_range("--deadline-ms", options.deadline_ms, 1, MOST_DEADLINE_MS)
     _check_range("--max-body-mb", options.max_body_mb, 0.001, 1024)
     _check_range("--poll-s", options.poll_s, 0.05, 3600)
+    _check_range("--registry-poll-s", options.registry_poll_s, 0.05, 3600)
+    source = source_of(options)
     tokens = Tokens(options.token_file) if options.token_file is not None else None
     check_host(options.host, tokens)
     if (options.tls_cert is None) != (options.tls_key is None):
@@ -124,7 +136,7 @@ def _checked(options: argparse.Namespace) -> _Settings:
             ) from error
     cell = read_cell(options.cell) if options.cell is not None else Cell()
     trusted = load_public_key(options.key if options.key is not None else keys_folder() / PUBLIC_NAME)
-    state = options.state if options.state is not None else default_state(options.bundle)
+    state = options.state if options.state is not None else default_state(source.name)
     store, problem = None, ""
     try:
         store = LastKnownGood(state)
@@ -132,11 +144,13 @@ def _checked(options: argparse.Namespace) -> _Settings:
         problem = (
             f"nothing can be kept for the next start: the state folder {state} cannot be written ({error.strerror})"
         )
+    bundles = source.bundles(state, trusted)
 
     def make_estimator(bundle: Bundle) -> PoseEstimator:
         return PoseEstimator(bundle, threads=options.threads, crop=cell.crop)
 
-    return _Settings(problem, BundleLoader(trusted, make_estimator, store), cell, tokens, options.tls_cert is not None)
+    loader = BundleLoader(trusted, make_estimator, store, None if bundles is None else bundles.origin_of)
+    return _Settings(problem, source, bundles, loader, cell, tokens, options.tls_cert is not None)
 
 
 def _check_range(name: str, value: float, least: float, most: float) -> None:
@@ -161,7 +175,8 @@ def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.so
     version = importlib.metadata.version("attentionvote")
     metrics = Metrics()
     serving = Serving(metrics)
-    watch = BundleWatch(options.bundle, settings.loader, serving, metrics, options.poll_s)
+    polls = options.poll_s, options.registry_poll_s
+    watch = settings.source.watch(settings.bundles, settings.loader, serving, metrics, *polls)
     limits = Limits(options.deadline_ms, int(options.max_body_mb * _MEBIBYTE))
     answering = Answering(serving, Gate(options.queue, metrics), limits, metrics)
     app = application(answering, watch, metrics, settings.cell, settings.tokens, version)
@@ -173,6 +188,8 @@ def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.so
         say("last_known_good", settings.problem, logging.WARNING)
     if settings.tokens is not None and settings.tokens.readable_by_others:
         say("token", f"{options.token_file} can be read by everybody on this machine: chmod 600 it", logging.WARNING)
+    for warning in settings.source.warnings:
+        say("registry", warning, logging.WARNING)
     print(json.dumps({"url": url, "pid": os.getpid()}), flush=True)
     config = uvicorn.Config(
         app, loop="asyncio", http="h11", ws="none", lifespan="on", interface="asgi3",

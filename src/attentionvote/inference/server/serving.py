@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from attentionvote.contract import ModelCard
 from attentionvote.inference.answer import DIGEST_LENGTH
 from attentionvote.inference.estimator import PoseEstimator
+from attentionvote.inference.registry_reference import RegistryVersion
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.refusal import Refusal, bad_request, nearest
@@ -25,11 +26,13 @@ class Served:
         estimator: of the verified bundle.
         kept: whether a copy for the next start is on the disk.
         last_known_good: whether it came from such a copy, not from the given path.
+        origin: which registered version it is; None where it came from a path.
     """
 
     estimator: PoseEstimator
     kept: bool
     last_known_good: bool
+    origin: RegistryVersion | None = None
 
     @property
     def card(self) -> ModelCard:
@@ -95,11 +98,13 @@ class Serving:
         self._metrics.serving(
             served.name, served.version, served.digest, kept=served.kept, last_known_good=served.last_known_good
         )
+        self._metrics.registered(served.origin)
         self._metrics.ready.set(1)
         say(
             "model", f"{served.name} {served.version} serves",
             part=served.name, version=served.version, digest=served.digest,
             kept=served.kept, last_known_good=served.last_known_good, before=old.version if old else None,
+            registry=str(served.origin) if served.origin else None,
             level=logging.WARNING if served.last_known_good or not served.kept else logging.INFO,
         )  # fmt: skip
         if old is not None and old.estimator is not served.estimator:
