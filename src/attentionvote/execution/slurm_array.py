@@ -23,6 +23,7 @@ from attentionvote.execution.failures import Attempts
 from attentionvote.execution.outcome import inherited, perform, worker_environment
 
 _ELEMENTS = 1000  # SLURM's MaxArraySize is 1001 where nobody has changed it
+_END_S = 10.0  # what processes of this machine get to end
 _SHARES = 4  # elements a worker: evens out jobs of unequal length
 
 
@@ -111,9 +112,15 @@ class _Run:
                 time.sleep(self.array.poll_s)
 
     def cancel(self) -> None:
-        """End what still runs."""
-        for element in self.elements:
-            element.cancel(check=False)
+        """End what still works on a job."""
+        for element, share in self.elements.items():
+            if self.missing.intersection(share):
+                element.cancel(check=False)
+        deadline = time.monotonic() + _END_S
+        while self.array.system == "local" and time.monotonic() < deadline:
+            if all(element.done() for element in self.elements):
+                break
+            time.sleep(0.02)
 
     def _arrived(self) -> Generator[tuple[int, bytes], None, None]:
         for path in sorted((self.call / "outcomes").glob("[0-9]*")):
@@ -129,8 +136,8 @@ class _Run:
         lost: list[int] = []
         for element, share in list(self.elements.items()):
             left = [index for index in share if index in self.missing]
-            if left and not element.done():
-                continue
+            if (left or self.array.system == "local") and not element.done():
+                continue  # processes of this machine are waited for in any case
             if left and time.monotonic() - self.ended.setdefault(element, time.monotonic()) < self._settle_s():
                 continue
             if any((self.call / "outcomes" / str(index)).exists() for index in left):
