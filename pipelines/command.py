@@ -7,8 +7,8 @@ A verb is a script ``pipelines/<verb>.py`` with a function ``run(cfg) -> dict``:
 
 The dictionary is printed as the only line on stdout, one JSON object; everything else that is
 printed while the verb runs, by anybody, goes to stderr. Exit codes: 0 success, 2 impossible
-configuration (before any work), 130 interrupted, 1 anything else. With ``-m`` the words are a grid of jobs
-(``multirun.py``). Heavy imports belong inside ``run``, so that
+configuration (before any work), 130 interrupted, 1 anything else (``Refused`` prints its line too).
+With ``-m`` the words are a grid of jobs (``multirun.py``). Heavy imports belong inside ``run``, so that
 ``--help`` and a misspelt word are answered at once.
 """
 
@@ -25,11 +25,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from configuration import CONF, ConfigurationError, choices, compose, leaves, sentence
+from configuration import CONF, ConfigurationError, choices, compose, leaves, primary_groups, sentence
 from hydra.errors import InstantiationException
 from job_process import join_starter, report_failure
 from multirun import run_grid
 from omegaconf import DictConfig, OmegaConf
+from refusal import Refused
 
 __all__ = ["ConfigurationError", "command", "configuring"]
 
@@ -111,14 +112,20 @@ def _print_result(run: Run, cfg: DictConfig) -> None:
     sys.stdout.flush()
     stdout = os.dup(1)
     os.dup2(2, 1)
+    refusal, result = None, None
     try:
-        result = run(cfg)
+        try:
+            result = run(cfg)
+        except Refused as error:
+            refusal, result = error, error.result
         sys.stdout.flush()
     finally:
         os.dup2(stdout, 1)
         os.close(stdout)
     if result is not None:
         print(json.dumps(result, default=_jsonable), flush=True)
+    if refusal is not None:
+        raise refusal
 
 
 def _jsonable(value: Any) -> Any:
@@ -169,6 +176,8 @@ def _one_sentence(verb: str) -> Iterator[None]:
         yield
     except ConfigurationError as error:
         _leave(f"{verb}: {sentence(error)}", 2)
+    except Refused as error:
+        _leave(f"{verb}: {sentence(error)}", 1)
     except InstantiationException as error:
         cause = _root(error)
         if isinstance(cause, (ValueError, TypeError, OSError, InstantiationException)):
@@ -227,10 +236,9 @@ def _help(verb: str, conf: Path) -> str:
     lines = [(sys.modules["__main__"].__doc__ or verb).strip(), ""]
     primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
     assert isinstance(primary, dict)
-    chosen = [item for item in primary.get("defaults", []) if isinstance(item, dict)]
-    names = [str(key).removeprefix("override ").split("@")[0].strip("/") for item in chosen for key in item]
-    lines += [f"  {name}=  {' | '.join(choices(name, conf))}" for name in names if (conf / name).is_dir()]
-    mandatory = [f"{g}={choices(g, conf)[0]}" for i in chosen for g, v in i.items() if v == "???" and choices(g, conf)]
+    chosen = primary_groups(verb, conf)
+    lines += [f"  {name}=  {' | '.join(choices(name, conf))}" for name in chosen if (conf / name).is_dir()]
+    mandatory = [f"{g}={choices(g, conf)[0]}" for g, v in chosen.items() if v == "???" and choices(g, conf)]
     try:
         settings = leaves(OmegaConf.to_container(compose(verb, mandatory, conf)))
     except ConfigurationError:  # e.g. a mandatory setting: show what the file itself holds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ from typing import Any
 from evaluation_job import EvaluationJob
 from evaluation_report import described, show
 from omegaconf import DictConfig
+from refusal import Refused
 
 from attentionvote.export import Limits
 from attentionvote.inference import Bundle, BundleError, load_bundle
 from attentionvote.registry.gates import Evidence, Gate, Rules, judge
 from attentionvote.registry.history import History
-from attentionvote.registry.measurement import Measurement
-from attentionvote.registry.promotion import Standing, move, stand
+from attentionvote.registry.measurement import EvaluationSet, Measurement
+from attentionvote.registry.promotion import Standing, Superseded, move, stand
 from attentionvote.registry.versions import Version, Versions
 
 log = logging.getLogger("attentionvote.promote")
@@ -62,7 +63,7 @@ class PromotionJob:
         if champion is None or champion.digest != bundle.digest:
             return None
         log.info("%s: bundle %s is the champion, version %d", self.name, bundle.digest[:12], champion.number)
-        return self._answer(champion, promoted=False)
+        return self._answer(champion)
 
     @property
     def name(self) -> str:
@@ -73,7 +74,7 @@ class PromotionJob:
         """Measure, judge, register, move.
 
         Raises:
-            ValueError: when a gate fails, or somebody else moved the champion meanwhile.
+            Refused: when a gate fails, or somebody else moved the champion meanwhile.
         """
         frozen = self.evaluation.evaluation_set()
         with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
@@ -94,24 +95,23 @@ class PromotionJob:
         version = self.versions.register(
             self.evaluation.bundle, facts | {"decision": "refused" if failed else "passed"}
         )
-        before = self.standing.champion.number if self.standing.champion else None
+        answer = self._answer(version, report, gates, frozen)
         if failed:
             why = f"{len(failed)} of {len(gates)} gates failed: " + ", ".join(gate.name for gate in failed)
+            before = self.standing.champion.number if self.standing.champion else None
             self.history.append("refuse", version.number, before, version.digest, self.standing.base, why, facts)
-            raise ValueError(
+            raise Refused(
                 f"{self.name} version {version.number} stays a candidate, because {why} (first: {failed[0].demands}, "
-                f"got {failed[0].found})"
+                f"got {failed[0].found})",
+                answer,
             )
-        move(self.versions, self.history, self.standing, "promote", version, self.why, facts)
+        try:
+            move(self.versions, self.history, self.standing, "promote", version, self.why, facts)
+        except Superseded as error:
+            raise Refused(str(error), answer) from error
         self.versions.tag(version, {"decision": "promoted"})
         log.info("%s: version %d is the champion now%s", self.name, version.number, self._instead())
-        return self._answer(version, promoted=True) | {
-            "before": before,
-            "gates": {gate.name: gate.found for gate in gates},
-            "figures": report["figures"],
-            "intervals": report["intervals"],
-            "evaluation_set": frozen.digest,
-        }
+        return answer | {"promoted": True, "champion": version.number}
 
     def _champion(self, folder: Path) -> Bundle | None:
         """The champion's bundle, from the registry."""
@@ -141,15 +141,32 @@ class PromotionJob:
     def _instead(self) -> str:
         return f", instead of {self.standing.champion.number}" if self.standing.champion else ""
 
-    def _answer(self, version: Version, promoted: bool) -> dict[str, Any]:
-        return {
+    def _answer(
+        self,
+        version: Version,
+        report: Mapping[str, Any] | None = None,
+        gates: Sequence[Gate] = (),
+        frozen: EvaluationSet | None = None,
+    ) -> dict[str, Any]:
+        """The dictionary of the JSON line while nothing is moved."""
+        champion = self.standing.champion.number if self.standing.champion else None
+        answer = {
             "stage": "promote",
             "object": self.name,
             "model": self.versions.name,
             "version": version.number,
             "bundle": version.digest,
-            "promoted": promoted,
-            "champion": version.number,
+            "promoted": False,
+            "champion": champion,
+            "before": champion,
+        }
+        if report is None or frozen is None:
+            return answer
+        return answer | {
+            "gates": {gate.name: {"holds": gate.holds, "demands": gate.demands, "found": gate.found} for gate in gates},
+            "figures": report["figures"],
+            "intervals": report["intervals"],
+            "evaluation_set": frozen.digest,
         }
 
 

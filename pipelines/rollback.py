@@ -14,6 +14,7 @@ from typing import Any
 
 from command import command, configuring
 from omegaconf import DictConfig
+from refusal import Refused
 
 log = logging.getLogger("attentionvote.rollback")
 
@@ -24,7 +25,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
     from attentionvote.inference import load_bundle
     from attentionvote.registry.history import History
-    from attentionvote.registry.promotion import move, stand, target
+    from attentionvote.registry.promotion import Superseded, move, stand, target
     from attentionvote.registry.versions import Versions
 
     with configuring():
@@ -37,18 +38,22 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         version = target(versions, standing, cfg.to)
         with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
             load_bundle(versions.fetch(version, Path(folder)), key)
-    move(versions, history, standing, "rollback", version, cfg.why)
     before = standing.champion.number if standing.champion else None
-    log.info("%s: version %d is the champion again, instead of %s", cfg.object.name, version.number, before or "none")
-    return {
+    answer = {
         "stage": "rollback",
         "object": cfg.object.name,
         "model": versions.name,
         "version": version.number,
         "bundle": version.digest,
-        "champion": version.number,
+        "champion": before,
         "before": before,
     }
+    try:
+        move(versions, history, standing, "rollback", version, cfg.why)
+    except Superseded as error:
+        raise Refused(str(error), answer) from error
+    log.info("%s: version %d is the champion again, instead of %s", cfg.object.name, version.number, before or "none")
+    return answer | {"champion": version.number}
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import promote
 import pytest
 import rollback
 from configuration import ConfigurationError, compose
+from refusal import Refused
 
 from attentionvote import tracking
 from attentionvote.registry.versions import Versions
@@ -57,7 +58,7 @@ def test_from_promotion_to_rollback(verb, model, store, capsys):
     second = model("two")
     done = verb("promote")
     assert (done["version"], done["before"], done["champion"]) == (2, 1, 2)
-    assert done["gates"]["champion ap_10"].startswith(f"{done['figures']['ap_10']:.4f} +0.0000")
+    assert done["gates"]["champion ap_10"]["found"].startswith(f"{done['figures']['ap_10']:.4f} +0.0000")
     table = " ".join(capsys.readouterr().err.split())
     assert "gates, against champion version 1" in table
     versions = Versions(store, "brick")
@@ -85,8 +86,10 @@ def test_a_model_that_fails_a_gate_stays_a_candidate_and_is_told(verb, model, st
     verb("promote")
     bad = model("two", graph={"offsets": [[1.0, 0, 0]] * 4})
     said = r"brick version 2 stays a candidate, because 1 of 16 gates failed: floor ap_10 \(first: ap_10 at least 0.9"
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(Refused, match=said) as refusal:
         verb("promote", "gates.floors.ap_10=0.9")
+    assert (refusal.value.result["promoted"], refusal.value.result["champion"]) == (False, 1)
+    assert refusal.value.result["gates"]["floor ap_10"]["holds"] is False
     versions = Versions(store, "brick")
     assert versions.champion().number == 1
     candidate = versions.of_bundle(bad.digest)
@@ -111,7 +114,7 @@ def test_gates_can_be_switched_off_one_by_one(verb, model):
 
 def test_missing_provenance_is_refused(verb, export_brick):
     export_brick("orphan")
-    with pytest.raises(ValueError, match="stays a candidate, because 1 of 11 gates failed: config"):
+    with pytest.raises(Refused, match="stays a candidate, because 1 of 11 gates failed: config"):
         verb("promote")
 
 
@@ -170,7 +173,8 @@ def test_of_two_processes_that_promote_at_once_exactly_one_wins(verb, model, sto
     winner = next(i for i in range(2) if both[i].returncode == 0)
     assert json.loads(ends[winner][0])["bundle"] == digests[winner]
     assert "came first: run the same command again to decide against the new champion" in ends[1 - winner][1]
-    assert ends[1 - winner][0] == ""
+    assert json.loads(ends[1 - winner][0])["promoted"] is False
+    assert "outputs/logs" not in ends[1 - winner][1]
     assert Versions(store, "brick").champion().digest == digests[winner]
     events = verb("history")["events"]
     assert [(e["decision"], e["counts"]) for e in events[1:]] == [("promote", True), ("promote", False)]
