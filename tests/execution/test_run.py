@@ -160,7 +160,12 @@ def test_slurm_without_sbatch_or_with_parts_of_a_gpu_is_refused(
 def test_an_array_is_asked_for_as_sbatch_wants_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The real submitit against an sbatch that writes down what it is given: no SLURM is needed for that."""
     sbatch = f"cat \"$1\" > {tmp_path}/asked\necho 'Submitted batch job 77'"
-    for program, text in (("sbatch", sbatch), ("srun", ""), ("sacct", ""), ("scancel", f"echo $* >> {tmp_path}/cancelled")):
+    for program, text in (
+        ("sbatch", sbatch),
+        ("srun", ""),
+        ("sacct", ""),
+        ("scancel", f"echo $* >> {tmp_path}/cancelled"),
+    ):
         (tmp_path / program).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / program).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
