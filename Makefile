@@ -12,6 +12,7 @@ NAME ?=
 MESH ?=
 UNITS ?=
 RUN ?=
+TRIALS ?=
 TO ?=
 ARGS ?=
 PYTEST_ARGS ?=
@@ -29,7 +30,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train smoke export evaluate promote rollback history serve keys bench-serve image generate view part ui test test-fast lint format clean
+.PHONY: help setup system train sweep smoke export evaluate promote rollback history serve keys bench-serve image generate view part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -59,6 +60,9 @@ system:
 
 train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [ARGS="experiment=paper ..."]; resumes by itself
 	@$(PY) pipelines/train.py $(object) $(ARGS)
+
+sweep: $(STAMP) ## Search the settings that train best: OBJECT=connecting_rod [TRIALS=30 ARGS="workers=2 save_as=rod"]
+	@$(PY) pipelines/sweep.py $(object) $(if $(TRIALS),trials=$(TRIALS)) $(ARGS)
 
 smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores: scenes, training, export, champion, a cell's check
 	@$(PY) pipelines/train.py object=$(smoke_object) experiment=smoke $(ARGS)

@@ -63,6 +63,20 @@ def groups(conf: Path = CONF) -> list[str]:
     return sorted(p.relative_to(conf).as_posix() for p in conf.rglob("*") if p.is_dir() and any(p.glob("*.yaml")))
 
 
+def primary_groups(verb: str, conf: Path = CONF) -> dict[str, str | None]:
+    """Group and choice of a verb's defaults list, those of other verbs' files that it includes among them."""
+    primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
+    assert isinstance(primary, dict)
+    found: dict[str, str | None] = {}
+    for item in primary.get("defaults", []):
+        if isinstance(item, dict):
+            for group, choice in item.items():
+                found[str(group).removeprefix("override ").removeprefix("optional ").split("@")[0].strip("/")] = choice
+        elif (conf / f"{item}.yaml").is_file():
+            found |= primary_groups(item, conf)
+    return found
+
+
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every dotted key below ``node`` (plain containers) with its value; empty mappings count as values."""
     if isinstance(node, Mapping) and node:

@@ -33,3 +33,17 @@ def locked_folder(folder: Path, outputs: str, work: str) -> Iterator[None]:
         except BlockingIOError as error:
             raise ConfigurationError(f"another process is at this {work} ({folder}): wait for it, or end it") from error
         yield
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process is in the folder; False when there is no such folder."""
+    try:
+        lock = (folder / ".lock").open("r+")
+    except OSError:
+        return False
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False

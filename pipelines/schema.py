@@ -76,6 +76,14 @@ RANGES: tuple[Range, ...] = (
     Range("trusted_key", kind=str),
     Range("to", low=1, kind=int),
     Range("last", low=1),
+    Range("trials", low=1),
+    Range("storage", kind=str),
+    Range("save_as", kind=str),
+    Range("heartbeat_s", low=1, high=3600),
+    Range("sweep.sampler.random_trials", low=1),
+    Range("sweep.pruner.kind", options=("median", "hyperband", "none")),
+    Range("sweep.pruner.reduction", low=2, high=100),
+    Range("sweep.pruner.least_*", low=1),
     Range("gates.floors.*", low=0, high=1, kind=float),
     Range("gates.margins.*", low=0, high=1, kind=float),
     Range("gates.provenance", options=("commit", "data", "config", "versions", "signature")),
@@ -164,6 +172,9 @@ RANGES: tuple[Range, ...] = (
 # Settings that may be negative: coordinates, angles and offsets.
 SIGNED: tuple[str, ...] = ("object.symmetry.*", "*axis*", "*offset*")
 
+# Settings that name a database or a server.
+ADDRESSES = ("tracking.store", "storage")
+
 
 def range_of(key: str) -> Range:
     """The range of a dotted key."""
@@ -184,6 +195,14 @@ def _scalars(value: Any) -> Iterator[Any]:
 def violation(key: str, value: Any) -> str:
     """One sentence when ``value`` (a scalar or a list of them) is out of range, else an empty string."""
     allowed = range_of(key)
+    if key in ADDRESSES and isinstance(value, str):
+        from attentionvote.tracking.store import has_password, shown
+
+        if has_password(value):
+            return (
+                f"{key} must not hold a password, because settings are kept with every run; got {shown(value)!r}: "
+                "set MLFLOW_TRACKING_URI or PGPASSWORD"
+            )
     for item in _scalars(value):
         if not allowed.accepts(item):
             close = get_close_matches(str(item), allowed.options, n=1)

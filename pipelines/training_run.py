@@ -17,6 +17,7 @@ from json_files import write_json
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
+from sweep_trial import best_score, trial_callbacks
 from training_data import prepare_data
 from training_job import MODEL, RESULT, RUN, TrainingJob
 from training_messages import plain_loader_errors, quiet_lightning
@@ -29,6 +30,7 @@ from attentionvote.evaluation import SceneResult
 from attentionvote.model import AttentionVote
 from attentionvote.simulation import Sensor
 from attentionvote.tracking.provenance import git_state
+from attentionvote.tracking.store import connect, resolve_store
 from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
 from attentionvote.training.checkpoint import FORMAT, AtomicCheckpoints, usable_checkpoint
 from attentionvote.training.pictures import ScenePictures
@@ -105,6 +107,8 @@ class TrainingRun:
         """Everything; the dictionary of the JSON line, None where the first process prints it."""
         start = time.monotonic()
         self._introduce()
+        if not self.place.rank:
+            connect(resolve_store(self.cfg.tracking.store))  # said before the scenes are made, not after
         clouds, digests = prepare_data(self.cfg, self.job, self.clouds, self.workers, self.place, self.first_does)
         self.module.metadata["data"] |= digests
         data_seconds = time.monotonic() - start
@@ -126,6 +130,7 @@ class TrainingRun:
                     "run_id": tracked.id,
                     "model": str(model_file),
                     "checkpoint": str(weights),
+                    "val_ap": best_score(self.trainer),
                     **assessed,
                     "losses": losses,
                     "steps": step,
@@ -221,6 +226,7 @@ class TrainingRun:
         self.pictures = ScenePictures()
         self.checkpoint_files = AtomicCheckpoints()
         callbacks: list[Callback] = [best, last, self.progress, self.pictures]
+        callbacks += trial_callbacks()
         if t.average_decay:
             callbacks.append(EMAWeightAveraging(decay=t.average_decay, use_buffers=True))
         if self.place.processes > 1:

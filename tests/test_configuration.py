@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from configuration import CONF, compose, leaves
+from configuration import CONF, compose, leaves, primary_groups
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.utils import get_object, instantiate
@@ -36,12 +36,7 @@ def group_of(path: Path) -> str:
 
 def defaults_of(verb: str) -> dict[str, str]:
     """Group and choice of a verb's defaults list."""
-    primary = OmegaConf.to_container(OmegaConf.load(CONF / f"{verb}.yaml"))
-    assert isinstance(primary, dict)
-    items = [item for item in primary.get("defaults", []) if isinstance(item, dict)]
-    return {
-        str(k).split("@")[0].strip("/").removeprefix("optional "): str(v) for item in items for k, v in item.items()
-    }
+    return {group: str(choice) for group, choice in primary_groups(verb).items()}
 
 
 def words_for(verb: str) -> list[str]:

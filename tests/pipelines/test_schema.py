@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 import pytest
-from configuration import CONF, choices, compose, leaves
+from configuration import CONF, choices, compose, leaves, primary_groups
 from omegaconf import OmegaConf
 from schema import RANGES, Range, range_of, violation
 
@@ -16,13 +16,10 @@ VERBS = sorted(p.stem for p in CONF.glob("*.yaml"))
 @cache
 def settings(verb: str) -> dict[str, Any]:
     """Every setting of a verb with its default, over every choice of every group (one object stands for all)."""
-    primary = OmegaConf.to_container(OmegaConf.load(CONF / f"{verb}.yaml"))
-    assert isinstance(primary, dict)
-    items = [item for item in primary.get("defaults", []) if isinstance(item, dict)]
-    named = {str(key).split("@")[0].strip("/") for item in items for key in item}
+    named = primary_groups(verb)
     part = ["object=connecting_rod"] if "object" in named else []
     part += ["name=bracket", "mesh=bracket.stl"] if verb == "part" else []
-    variants = [[f"{group}={choice}"] for group in sorted(named - {"object"}) for choice in choices(group)]
+    variants = [[f"{group}={choice}"] for group in sorted(set(named) - {"object"}) for choice in choices(group)]
     found: dict[str, Any] = {}
     for words in [[], *variants]:
         for key, value in leaves(OmegaConf.to_container(compose(verb, [*part, *words]))):

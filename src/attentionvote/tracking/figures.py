@@ -142,3 +142,43 @@ def ap_threshold_figure(
     if average_precisions:
         axes.legend(loc="lower right", fontsize=12, frameon=False)
     return figure
+
+
+def importance_figure(shares: Mapping[str, float]) -> Figure:
+    """How much each setting of a sweep matters, as bars.
+
+    Args:
+        shares: by setting, together 1.
+
+    Raises:
+        ValueError: there is no setting.
+    """
+    if not shares:
+        raise ValueError("an importance figure must have at least one setting, got none")
+    ordered = sorted(shares.items(), key=lambda item: item[1])
+    figure = new_figure(1.6 + 0.5 * len(ordered))
+    axes = figure.subplots()
+    bars = axes.barh([name for name, _ in ordered], [share for _, share in ordered], color=PALETTE[0])
+    axes.bar_label(bars, fmt="%.2f", padding=4, fontsize=12)
+    _polish(axes, "What matters most", "share of what makes a trial good", "")
+    axes.set_xlim(0, 1.08 * max(1e-9, ordered[-1][1]))
+    return figure
+
+
+def trials_figure(trials: Mapping[str, tuple[Sequence[int], Sequence[float]]]) -> Figure:
+    """The score of every trial of a sweep, and the best so far of those that are complete.
+
+    Args:
+        trials: by state -> (numbers, scores); the best is taken of the first state.
+    """
+    figure = new_figure(7.0)
+    axes = figure.subplots()
+    for index, (label, (numbers, scores)) in enumerate(trials.items()):
+        axes.plot(numbers, scores, "ox"[index % 2], color=PALETTE[index % len(PALETTE)], label=label)
+        if index == 0 and len(numbers):
+            best = np.maximum.accumulate(np.asarray(scores, dtype=np.float64))
+            axes.step(numbers, best, where="post", color=PALETTE[index], linewidth=2.2, label="best so far")
+    _polish(axes, "Trials", "trial", "val/ap")
+    axes.set_ylim(bottom=0)
+    axes.legend(loc="lower right", fontsize=12, frameon=False)
+    return figure

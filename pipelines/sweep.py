@@ -1,0 +1,69 @@
+"""Search the settings that train best: trials are ordinary trainings, judged by val/ap of their best checkpoint.
+
+    make sweep OBJECT=connecting_rod TRIALS=30 [ARGS="workers=2 trainer.max_epochs=12 save_as=rod"]
+
+The space is a file of conf/sweep/. Stopped, also by kill -9, the same command goes on; TRIALS is what the study shall
+have in all. The best settings are an experiment afterwards: make train OBJECT=connecting_rod ARGS=experiment=rod.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from command import command, configuring
+from configuration import CONF, parse, primary_groups
+from omegaconf import DictConfig, OmegaConf
+from train import preset_of_hardware
+
+log = logging.getLogger("attentionvote.sweep")
+
+
+def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
+    """Bring the study to its total; its best trial.
+
+    Args:
+        cfg: the sweep's configuration.
+        words: it was composed of; those of the training are handed on to the trials.
+    """
+    from folder_lock import locked_folder
+    from sweep_job import SweepJob
+    from sweep_report import check_save_as
+
+    base = [*preset_of_hardware(list(words)), *training_words(words)]
+    check_save_as(cfg.save_as)
+    with configuring():
+        job = SweepJob(cfg, base, _space_name(words))
+    with locked_folder(job.folder, cfg.sweeps, "sweep"):
+        with configuring():
+            job.open()
+        return job.run()
+
+
+def training_words(words: Sequence[str]) -> list[str]:
+    """The words that are about the trainings, not about the sweep."""
+    own = set(OmegaConf.load(CONF / "sweep.yaml")) - {"defaults"} | {"sweep", "workers", "force", "resume"}
+    return [word for word, o in zip(words, parse(words), strict=True) if o.key_or_group.split(".")[0] not in own]
+
+
+def _space_name(words: Sequence[str]) -> str:
+    """The chosen file of conf/sweep."""
+    said = [word.partition("=")[2] for word in words if word.lstrip("+").startswith("sweep=")]
+    return said[-1] if said else str(primary_groups("sweep")["sweep"])
+
+
+def check(cfg: DictConfig) -> None:
+    """What a grid of sweeps asks of each before the first starts."""
+    from sweep_space import parse_space
+
+    parse_space(_plain(cfg.sweep.space), cfg)
+
+
+def _plain(node: Any) -> Any:
+    return OmegaConf.to_container(node, resolve=True)
+
+
+if __name__ == "__main__":
+    command("sweep", lambda cfg: run(cfg, sys.argv[1:]), defaults=preset_of_hardware, check=check)

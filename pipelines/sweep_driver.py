@@ -1,0 +1,170 @@
+"""Runs the trials of a study side by side, each an ordinary training in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from folder_lock import is_locked
+from job_process import INTERRUPTED, JobProcess, Outcome, interrupt
+from optuna.trial import FrozenTrial, Trial, TrialState
+from sweep_study import Ledger
+from trial_place import PRUNED_AT, PRUNED_CODE
+
+log = logging.getLogger("attentionvote.sweep")
+TRAIN = Path(__file__).with_name("train.py")
+_POLL_S = 0.1
+
+
+@dataclass
+class Running:
+    """A trial whose process runs."""
+
+    trial: Trial
+    directory: Path
+    process: JobProcess
+    files: ExitStack
+    start_s: float = field(default_factory=time.monotonic)
+
+
+class SweepDriver:
+    """Brings a study to its total.
+
+    Args:
+        ledger: of the study.
+        words: the words of the training with the given values of the searched settings.
+        directory: the folder of that training.
+        environment: of the process of the trial of this number.
+        workers: most trials at a time.
+        retries: how often a trial whose process died is taken up again.
+        heartbeat_s: between signs of life.
+        logs: folder of what the trainings say.
+        ended: called with every trial that has ended.
+        script: that trains.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        words: Callable[[Mapping[str, Any]], Sequence[str]],
+        directory: Callable[[Mapping[str, Any]], Path],
+        environment: Callable[[int], Mapping[str, str]],
+        workers: int,
+        retries: int,
+        heartbeat_s: float,
+        logs: Path,
+        ended: Callable[[FrozenTrial], object],
+        script: Path = TRAIN,
+    ) -> None:
+        self.ledger, self.words, self.directory, self.environment = ledger, words, directory, environment
+        self.workers, self.retries, self.heartbeat_s = workers, retries, heartbeat_s
+        self.logs, self.ended, self.script = logs, ended, script
+        self.running: list[Running] = []
+        self.lost: deque[FrozenTrial] = deque()
+        self.waiting: deque[tuple[Trial, dict[str, Any]]] = deque()  # somebody else is at their training
+        self._beaten_s = -float("inf")
+
+    def run(self, total: int, tick: Callable[[], object]) -> None:
+        """Run until the study has ``total`` trials and all of them have ended.
+
+        Args:
+            total: trials in all, those of earlier calls included.
+            tick: called ten times a second.
+
+        Raises:
+            ValueError: when a sweep in another place is at this study.
+            KeyboardInterrupt: after the trials that run have ended orderly; they go on with the next call.
+        """
+        self.lost = deque(self.ledger.lost())
+        self.logs.mkdir(parents=True, exist_ok=True)
+        try:
+            while True:
+                self._start(total)
+                if not self.running and not self.waiting and not self.lost:
+                    return
+                time.sleep(_POLL_S)
+                self._collect()
+                self._beat()
+                tick()
+        finally:
+            interrupt([running.process for running in self.running])
+            for running in self.running:
+                running.files.close()
+
+    def _start(self, total: int) -> None:
+        for _ in range(len(self.waiting)):
+            trial, values = self.waiting.popleft()
+            self._launch_or_wait(trial, values)
+        while len(self.running) + len(self.waiting) < self.workers:
+            if self.lost:
+                lost = self.lost.popleft()
+                trial, values = self.ledger.begin(lost)
+                if PRUNED_AT in lost.user_attrs:  # decided, but nobody was there to write it down
+                    self._end(trial, self.directory(values), TrialState.PRUNED)
+                    continue
+            elif len(self.ledger.trials) < total:
+                trial, values = self.ledger.begin()
+            else:
+                return
+            self._launch_or_wait(trial, values)
+
+    def _launch_or_wait(self, trial: Trial, values: dict[str, Any]) -> None:
+        directory = self.directory(values)
+        # Another trial with the same values, or what a killed sweep left for some seconds.
+        taken = any(running.directory == directory for running in self.running) or is_locked(directory)
+        if taken or len(self.running) >= self.workers:
+            if not any(waiting is trial for waiting, _ in self.waiting):
+                self.waiting.append((trial, values))
+            return
+        files = ExitStack()
+        stderr = files.enter_context((self.logs / f"trial_{trial.number:03d}.log").open("ab"))
+        process = JobProcess(self.script, self.words(values), stderr, self.environment(trial.number))
+        self.running.append(Running(trial, directory, process, files))
+
+    def _collect(self) -> None:
+        for running in list(self.running):
+            outcome = running.process.poll()
+            if outcome is None:
+                continue
+            self.running.remove(running)
+            running.files.close()
+            self._judge(running, outcome)
+
+    def _judge(self, running: Running, outcome: Outcome) -> None:
+        trial, seconds = running.trial, round(time.monotonic() - running.start_s, 1)
+        about = {"seconds": round(float(trial.user_attrs.get("seconds", 0)) + seconds, 1)}
+        if outcome.code == INTERRUPTED:
+            raise KeyboardInterrupt
+        if outcome.code == PRUNED_CODE:
+            self._end(trial, running.directory, TrialState.PRUNED, **about)
+        elif outcome.result is not None:
+            value = outcome.result.get("val_ap")
+            about |= {"test": outcome.result.get("metrics", {})}
+            if value is None:
+                reason = "its training has no val/ap: it was made before there were sweeps, train it with force=true"
+                self._end(trial, running.directory, TrialState.FAIL, reason=reason, **about)
+            else:
+                self._end(trial, running.directory, TrialState.COMPLETE, float(value), **about)
+        elif outcome.code < 0 and self.ledger.crashed(trial) <= self.retries:
+            log.warning("trial %d is taken up again: %s", trial.number, outcome.sentence)
+            trial.set_user_attr("seconds", about["seconds"])
+            self.lost.append(self.ledger.trials[trial.number])
+        else:
+            self._end(trial, running.directory, TrialState.FAIL, reason=outcome.sentence, **about)
+
+    def _end(self, trial: Trial, directory: Path, state: TrialState, value: float | None = None, **about: Any) -> None:
+        # For whoever looks at the study with another tool; relative, as the settings are.
+        self.ledger.end(trial, state, value, directory=os.fspath(directory), **about)
+        self.ended(self.ledger.trials[trial.number])
+
+    def _beat(self) -> None:
+        if time.monotonic() - self._beaten_s >= self.heartbeat_s:
+            self.ledger.beat([running.trial for running in self.running] + [trial for trial, _ in self.waiting])
+            self._beaten_s = time.monotonic()

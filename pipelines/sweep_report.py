@@ -1,0 +1,150 @@
+"""What a sweep leaves: a table of its trials, what matters most, and the best settings as an experiment."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+from configuration import CONF, ConfigurationError, parse
+from optuna.exceptions import OptunaError
+from optuna.importance import get_param_importances
+from optuna.trial import FrozenTrial, TrialState
+from sweep_space import Setting
+from sweep_study import CRASHES, Ledger
+from training_job import NOT_IDENTITY, RUN
+
+MARK = "Written by make sweep"  # files without it are the user's, and never replaced
+_LEAST_FOR_IMPORTANCE = 4  # complete trials
+
+
+def trial_row(trial: FrozenTrial, space: Sequence[Setting]) -> dict[str, Any]:
+    """One trial as a row of the table: number, state, val/ap, what it tried, where its training is."""
+    reported = trial.intermediate_values
+    return {
+        "trial": trial.number,
+        "state": trial.state.name.lower(),
+        "val_ap": trial.value if trial.state == TrialState.COMPLETE else None,
+        "last_val_ap": reported[max(reported)] if reported else None,
+        "epochs": max(reported, default=None),
+        **{s.name: s.value(trial.params[s.name]) for s in space if s.name in trial.params},
+        "seconds": trial.user_attrs.get("seconds"),
+        "crashes": trial.user_attrs.get(CRASHES, 0),
+        "directory": trial.user_attrs.get("directory"),
+        "run_id": run_of(trial),
+        "reason": trial.user_attrs.get("reason"),
+    }
+
+
+def run_of(trial: FrozenTrial) -> str | None:
+    """Id of the trial's MLflow run, None while it has none."""
+    from json_files import read_json
+
+    directory = trial.user_attrs.get("directory")
+    run_id = (read_json(Path(directory) / RUN) or {}).get("run_id") if directory else None
+    return run_id if isinstance(run_id, str) else None
+
+
+def write_table(ledger: Ledger, folder: Path) -> list[Path]:
+    """``trials.json`` and ``trials.csv`` with a row a trial."""
+    rows = [trial_row(trial, ledger.space) for trial in ledger.trials]
+    places = [folder / "trials.json", folder / "trials.csv"]
+    write_whole(places[0], json.dumps(rows, indent=2) + "\n")
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    temporary = places[1].with_name(f".{places[1].name}.{os.getpid()}")
+    with temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+    temporary.replace(places[1])
+    return places
+
+
+def importances(ledger: Ledger) -> dict[str, float]:
+    """Share of each setting in what makes a trial good (PED-ANOVA), the largest first; empty for too few trials."""
+    if ledger.count(TrialState.COMPLETE) < _LEAST_FOR_IMPORTANCE:
+        return {}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = get_param_importances(ledger.study)
+    except (ValueError, RuntimeError, OptunaError):  # all trials equally good, say
+        return {}
+    return {name: float(share) for name, share in found.items()}
+
+
+def experiment_text(words: Sequence[str], values: Mapping[str, Any], title: str) -> str:
+    """The best settings as a file of ``conf/experiment``: what the sweep was given, and the best trial's values on top.
+
+    Args:
+        words: of the training that the sweep varies.
+        values: of the searched settings.
+        title: the comment at the top.
+
+    Raises:
+        ConfigurationError: when a word deletes a setting, which no such file can.
+    """
+    bases: list[Any] = []
+    overrides: list[Any] = []
+    settings: dict[str, Any] = {}
+    for override in parse(words):
+        key = override.key_or_group
+        if override.is_delete():
+            raise ConfigurationError(f"a sweep takes no word that deletes a setting, got {override.input_line!r}")
+        if key == "experiment":
+            bases = [] if override.value() is None else [str(override.value())]
+        elif (CONF / key).is_dir():
+            if key != "object":
+                overrides.append({f"override /{key}": override.value()})
+        elif key not in NOT_IDENTITY and not key.startswith("tracking."):
+            _put(settings, key, _plain(override.value()))
+    for name, value in values.items():
+        _put(settings, name, value)
+    content = {"defaults": [*bases, *overrides, "_self_"], **settings}
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
+    return f"# @package _global_\n# {title}\n# {MARK}, and by the next one again.\n{text}"
+
+
+def _plain(value: Any) -> Any:
+    """A parsed value without the quotes of Hydra's grammar."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value if value is None or isinstance(value, (bool, int, float)) else getattr(value, "text", str(value))
+
+
+def _put(settings: dict[str, Any], key: str, value: Any) -> None:
+    *sections, leaf = key.split(".")
+    for section in sections:
+        settings = settings.setdefault(section, {})
+    settings[leaf] = value
+
+
+def check_save_as(name: str | None, experiments: Path = CONF / "experiment") -> None:
+    """Refuse a name that is no file name, or that is a file of the user's.
+
+    Raises:
+        ConfigurationError: with one sentence.
+    """
+    if name is None:
+        return
+    if not name.replace("-", "_").isidentifier():
+        raise ConfigurationError(f"save_as must be a name of letters, digits, - and _, got {name!r}")
+    path = experiments / f"{name}.yaml"
+    if path.exists() and MARK not in path.read_text(encoding="utf-8"):
+        raise ConfigurationError(
+            f"save_as must not replace a file that no sweep wrote, got {name!r}: choose another name"
+        )
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)

@@ -1,0 +1,28 @@
+"""What a sweep and the process of a trial agree on; knows neither torch nor Optuna.
+
+A trial is an ordinary training. The sweep that starts it says so in one variable of the environment, because the
+study's database may have a password, which belongs into no command line and no tracked configuration.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+VARIABLE = "ATTENTIONVOTE_TRIAL"
+PRUNED_CODE = 3  # of a process whose trial was pruned
+PRUNED_AT = "pruned_at_epoch"  # attribute of the trial: the decision stands, whatever happens to its process
+
+
+def for_trial(url: str, study: str, number: int, heartbeat_s: int, pruner: Mapping[str, Any]) -> dict[str, str]:
+    """The environment of a trial's process.
+
+    Args:
+        url, study: where the trial is kept.
+        number: of the trial.
+        heartbeat_s: see ``sweep_study.open_study``.
+        pruner: arguments of ``sweep_study.make_pruner``.
+    """
+    about = {"url": url, "study": study, "number": number, "heartbeat_s": heartbeat_s, "pruner": dict(pruner)}
+    return {VARIABLE: json.dumps(about)}
