@@ -191,7 +191,8 @@ def fetch(registry: Registry, version: RegistryVersion, key: Ed25519PublicKey, f
     """
     manifest, signature = bytearray(), bytearray()
     for name, content in ((MANIFEST, manifest), (SIGNATURE, signature)):
-        registry.read_file(version, name, MOST_MANIFEST_BYTES, content.extend)
+        for piece in registry.pieces(version, name, MOST_MANIFEST_BYTES):
+            content.extend(piece)
     digest = hashlib.sha256(manifest).hexdigest()
     try:
         verify(bytes(manifest), bytes(signature), key)
@@ -226,13 +227,11 @@ def fetch(registry: Registry, version: RegistryVersion, key: Ed25519PublicKey, f
 def _fetch_file(registry: Registry, version: RegistryVersion, name: str, entry: Entry, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     digest = hashlib.sha256()
-    with path.open("xb") as file:
-
-        def write(piece: bytes) -> None:
+    pieces = registry.pieces(version, name, entry.bytes)
+    with path.open("xb") as file, contextlib.closing(pieces):
+        for piece in pieces:
             digest.update(piece)
             file.write(piece)
-
-        registry.read_file(version, name, entry.bytes, write)
         file.flush()
         os.fsync(file.fileno())
         size = file.tell()

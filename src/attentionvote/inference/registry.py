@@ -17,7 +17,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Callable, Iterable
+from collections.abc import Generator, Iterable
 from contextlib import closing
 from typing import IO, Any
 
@@ -112,14 +112,13 @@ class Registry:
             )
         return RegistryVersion(name, version, digest)
 
-    def read_file(self, version: RegistryVersion, name: str, most: int, write: Callable[[bytes], object]) -> None:
-        """Read a file of a version piece by piece.
+    def pieces(self, version: RegistryVersion, name: str, most: int) -> Generator[bytes, None, None]:
+        """A file of a version, piece by piece.
 
         Args:
             version: that holds it.
             name: of the file, relative to the bundle.
             most: bytes; not more are read.
-            write: gets the pieces.
 
         Raises:
             BundleError: when the version has no such file, or it is larger.
@@ -128,7 +127,7 @@ class Registry:
         query = {"name": version.name, "version": version.version, "path": name}
         longest_s = _LONGEST_ANSWER_S + most / _SLOWEST_BYTES_PER_S
         try:
-            self._get("/model-versions/get-artifact", query, most, longest_s, write)
+            yield from self._get("/model-versions/get-artifact", query, most, longest_s)
         except _Absent:
             raise BundleError(
                 f"{version} must hold {name}, but there is none: register a bundle with `make promote`"
@@ -137,10 +136,8 @@ class Registry:
             raise BundleError(f"{version}: {name} must have at most {most} bytes, got more: is it a bundle?") from None
 
     def _json(self, question: str, query: dict[str, str]) -> Any:
-        pieces: list[bytes] = []
         try:
-            self._get(_API + question, query, _MOST_JSON_BYTES, _LONGEST_ANSWER_S, pieces.append)
-            content = b"".join(pieces)
+            content = b"".join(self._get(_API + question, query, _MOST_JSON_BYTES, _LONGEST_ANSWER_S))
         except OverflowError:
             content = b""
         try:
@@ -151,10 +148,8 @@ class Registry:
     def _no_registry(self, got: str = "another kind of answer") -> str:
         return f"the registry {self.url} must be an MLflow server, got {got}"
 
-    def _get(
-        self, path: str, query: dict[str, str], most: int, longest_s: float, write: Callable[[bytes], object]
-    ) -> None:
-        """Read one answer.
+    def _get(self, path: str, query: dict[str, str], most: int, longest_s: float) -> Generator[bytes, None, None]:
+        """One answer, piece by piece.
 
         Raises:
             RegistryError: away or refused.
@@ -170,7 +165,7 @@ class Registry:
                     count += len(piece)
                     if count > most:
                         raise OverflowError
-                    write(piece)
+                    yield piece
                     if time.monotonic() > end or self._closed.is_set():
                         raise TimeoutError("the answer takes too long")
                 if response.length:  # what its header promised and did not come

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
-import ipaddress
 import json
 import os
 import signal
@@ -15,10 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 
 from attentionvote.inference.client import PoseClient, Unreachable
 from attentionvote.inference.server import health, serve
@@ -37,35 +31,8 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return line
 
 
-def certificate(folder: Path) -> tuple[Path, Path]:
-    """A certificate of 127.0.0.1 and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "cell")])
-    now = datetime.datetime.now(datetime.UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(minutes=1))
-        .not_valid_after(now + datetime.timedelta(hours=1))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    encoding, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
-    cert_file, key_file = folder / "cert.pem", folder / "key.pem"
-    cert_file.write_bytes(made.public_bytes(encoding))
-    key_file.write_bytes(key.private_bytes(encoding, form, serialization.NoEncryption()))
-    (folder / "locked.pem").write_bytes(
-        key.private_bytes(encoding, form, serialization.BestAvailableEncryption(b"password"))
-    )
-    return cert_file, key_file
-
-
 def test_options_that_cannot_work_are_one_sentence(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, trusted_key: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, trusted_key: Path, certificate: Any
 ) -> None:
     cert, key = certificate(tmp_path)
     good = ["bundle", "--key", str(trusted_key), "--state", str(tmp_path / "state")]
@@ -144,7 +111,12 @@ _leave(None)
 
 
 def test_tls_and_token_end_to_end(
-    start_server: Any, bundle_folder: Path, make_cloud: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    start_server: Any,
+    bundle_folder: Path,
+    make_cloud: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    certificate: Any,
 ) -> None:
     cert, key = certificate(tmp_path)
     token = tmp_path / "token"
