@@ -8,6 +8,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.setup-complete
 
 OBJECT ?=
+OBJECTS ?=
 NAME ?=
 MESH ?=
 UNITS ?=
@@ -17,6 +18,9 @@ TO ?=
 ARGS ?=
 PYTEST_ARGS ?=
 object := $(if $(OBJECT),object=$(OBJECT))
+# Of one training, each with a GPU of its own (docs/several-processes.md).
+PROCESSES ?=
+several := $(if $(PROCESSES),pipelines/start_processes.py --standalone --nproc-per-node=$(PROCESSES))
 
 smoke_object = $(or $(OBJECT),connecting_rod)
 bundle := outputs/export/$(OBJECT)/latest
@@ -30,7 +34,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train sweep smoke export evaluate promote rollback history serve keys bench-serve image generate view part ui test test-fast lint format clean
+.PHONY: help setup system train sweep fleet smoke export evaluate promote rollback history serve keys bench-serve image generate view part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -58,11 +62,14 @@ system:
 	@"$(PYTHON)" -c 'import ctypes; ctypes.CDLL("libstdc++.so.6")' 2>/dev/null || { \
 		echo "setup: the library libstdc++.so.6 is missing; install it (Debian: libstdc++6)" >&2; exit 1; }
 
-train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [ARGS="experiment=paper ..."]; resumes by itself
-	@$(PY) pipelines/train.py $(object) $(ARGS)
+train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [PROCESSES=8] [ARGS="experiment=paper ..."]; resumes
+	@$(PY) $(several) pipelines/train.py $(object) $(ARGS)
 
 sweep: $(STAMP) ## Search the settings that train best: OBJECT=connecting_rod [TRIALS=30 ARGS="workers=2 save_as=rod"]
 	@$(PY) pipelines/sweep.py $(object) $(if $(TRIALS),trials=$(TRIALS)) $(ARGS)
+
+fleet: $(STAMP) ## One model a part, and a leaderboard: OBJECTS=all or gear,brick [ARGS="experiment=paper workers=2"]
+	@$(PY) pipelines/fleet.py $(if $(OBJECTS),"objects='$(OBJECTS)'") $(ARGS)
 
 smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores: scenes, training, export, champion, a cell's check
 	@$(PY) pipelines/train.py object=$(smoke_object) experiment=smoke $(ARGS)

@@ -1,0 +1,43 @@
+"""torchrun for people: one training on several processes of this machine, or of several machines.
+
+    make train OBJECT=gear PROCESSES=8
+    .venv/bin/python pipelines/start_processes.py --standalone --nproc-per-node=8 pipelines/train.py object=gear
+
+Takes torchrun's arguments and does what torchrun does. When a process fails, its own sentence is the last word instead
+of torchrun's traceback, and its exit code is kept: 2 for an impossible configuration, 130 for Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+
+
+def main() -> int:
+    """Run torchrun; the exit code."""
+    # torchrun would set it too, and warn of it; trainer.threads says how many threads a process takes.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("LOGLEVEL", "CRITICAL")  # torchrun's own: that it ends the processes that are left
+    from torch.distributed.elastic.multiprocessing.api import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.run import main as torchrun
+
+    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)
+    try:
+        torchrun()
+    except SignalException as ended:
+        return 130 if ended.sigval == signal.SIGINT else 128 + int(ended.sigval)
+    except ChildFailedError as error:
+        _, first = error.get_first_failure()
+        if first.exitcode < 0:
+            name = signal.Signals(-first.exitcode).name
+            print(f"train: process {first.global_rank + 1} was ended by {name}", file=sys.stderr)
+            return 128 - first.exitcode
+        return first.exitcode
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
