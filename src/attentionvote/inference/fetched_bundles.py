@@ -54,8 +54,6 @@ class FetchedBundles:
         folder.mkdir(parents=True, exist_ok=True)
         self._record = FetchRecord(folder, reference)
         self._whole: set[str] = set()  # digests that were verified on disk by this process
-        with self._locked():
-            pass
 
     def origin_of(self, digest: str) -> RegistryVersion | None:
         """The version that a bundle is under this reference; None when the reference never named it."""
@@ -69,14 +67,16 @@ class FetchedBundles:
     def restore(self) -> None:
         """Let the link lead to the newest bundle of this reference that is there, or nowhere.
 
-        Without a question to the registry: what was linked may belong to another reference.
+        Without a question to the registry: what was linked may belong to another reference. A link that is right is
+        left alone, so that a cell starts on a disk that can no longer be written.
         """
-        with self._locked():
-            there = [v for v in self._record.versions() if (self.folder / v.digest[:DIGITS]).is_dir()]
-            if there:
-                self._point(there[0])
-            else:
+        there = [v for v in self._record.versions() if (self.folder / v.digest[:DIGITS]).is_dir()]
+        if not there and self.link.is_symlink():
+            with self._locked():
                 self.link.unlink(missing_ok=True)
+        elif there and self._target() != there[0].digest[:DIGITS]:
+            with self._locked():
+                self._point(there[0])
 
     def take(self, registry: Registry, version: RegistryVersion, serving: Collection[str] = ()) -> tuple[Path, bool]:
         """Fetch a version unless it is there, let the link lead to it, and forget old ones.
@@ -141,14 +141,18 @@ class FetchedBundles:
 
     def _point(self, version: RegistryVersion) -> None:
         name = version.digest[:DIGITS]
-        with contextlib.suppress(OSError):
-            if os.readlink(self.link) == name:
-                return
+        if self._target() == name:
+            return
         new = self.folder / f"fetching-{LATEST}"
         new.unlink(missing_ok=True)
         new.symlink_to(name)
         os.replace(new, self.link)
         sync(self.folder)
+
+    def _target(self) -> str | None:
+        with contextlib.suppress(OSError):
+            return os.readlink(self.link)
+        return None
 
     def _prune(self, keep: Collection[str]) -> None:
         """Remove what was fetched here once and is not kept; whatever else lies in the folder is not ours."""

@@ -9,9 +9,10 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -268,3 +269,41 @@ def infer_body() -> Callable[..., tuple[bytes, dict[str, str]]]:
         return head + raw, {"Inference-Header-Content-Length": str(len(head))}
 
     return encode
+
+
+@contextmanager
+def asking_all_the_time(server: Any, body: bytes) -> Iterator[list[dict[str, Any]]]:
+    """Two clients that ask all the time; every answer must be one."""
+    answers: list[dict[str, Any]] = []
+    failures: list[str] = []
+    end = threading.Event()
+
+    def ask() -> None:
+        while not end.is_set():
+            try:
+                reply = server.post("/poses", body)
+                if reply.status == 200:
+                    answers.append(reply.json)
+                else:
+                    failures.append(f"{reply.status}: {reply.error}")
+            except OSError as error:
+                failures.append(repr(error))
+            time.sleep(0.01)
+
+    clients = [threading.Thread(target=ask) for _ in range(2)]
+    for client in clients:
+        client.start()
+    try:
+        yield answers
+    finally:
+        end.set()
+        for client in clients:
+            client.join()
+    assert not failures
+    assert len(answers) > 10
+
+
+@pytest.fixture(scope="session")
+def continuous_requests() -> Callable[..., Any]:
+    """A context in which two clients ask all the time; their answers. It fails at its end when one got none."""
+    return asking_all_the_time

@@ -14,6 +14,7 @@ import pytest
 
 from attentionvote.inference.bundle import Bundle, load_bundle
 from attentionvote.inference.errors import BundleError, InputError
+from attentionvote.inference.registry_reference import parse_reference
 from attentionvote.inference.server import last_known_good
 from attentionvote.inference.server.last_known_good import LastKnownGood, default_state
 
@@ -139,6 +140,11 @@ def test_a_path_has_its_own_state_folder(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert default_state(tmp_path / "latest") == latest  # by name, not by what it leads to
     assert default_state(tmp_path / "real") != latest
     assert default_state(Path("/")).name.startswith("bundle-")
+    champion = default_state(parse_reference("models:/attentionvote-gear@champion"))
+    assert champion.name.startswith("attentionvote-gear_champion-")
+    assert default_state(parse_reference("models:/attentionvote-gear/3")) != champion
+    monkeypatch.chdir(tmp_path)  # a reference is the same wherever the server is started
+    assert default_state(parse_reference("models:/attentionvote-gear@champion")) == champion
     monkeypatch.delenv("ATTENTIONVOTE_STATE")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert default_state(Path("latest")).parent == tmp_path / "home" / ".local" / "state" / "attentionvote"

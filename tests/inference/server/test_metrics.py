@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from attentionvote.inference.registry_reference import RegistryVersion
 from attentionvote.inference.server.metrics import Metrics
 
 
@@ -42,3 +43,22 @@ def test_two_servers_in_a_process_count_apart() -> None:
     first.requests.labels("ok").inc()
     assert samples(first)["attentionvote_requests_total", "ok"] == 1.0
     assert samples(second)["attentionvote_requests_total", "ok"] == 0.0  # counted from 0, not absent
+
+
+def test_the_registered_version_and_the_registrys_problem_are_alone() -> None:
+    metrics = Metrics()
+    for number in ("1", "2"):
+        metrics.registered(RegistryVersion("attentionvote-gear", number, number * 64))
+        metrics.registry_problem(f"reason {number}")
+    found = samples(metrics)
+    assert [key[1:] for key in found if key[0] == "attentionvote_registry_info"] == [
+        ("2" * 64, "attentionvote-gear", "2")
+    ]
+    assert [key[1:] for key in found if key[0] == "attentionvote_registry_error_info"] == [("reason 2",)]
+    assert found["attentionvote_registry_failing",] == 1.0
+    metrics.registered(None)
+    metrics.registry_problem(None)
+    found = samples(metrics)
+    assert not [key for key in found if key[0] in ("attentionvote_registry_info", "attentionvote_registry_error_info")]
+    assert found["attentionvote_registry_failing",] == 0.0
+    assert found["attentionvote_registry_polls_total", "away"] == 0.0

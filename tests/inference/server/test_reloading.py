@@ -42,40 +42,8 @@ def padded(folder: Path) -> None:
     (folder / "part.ply").write_bytes(os.urandom(LARGE))
 
 
-@contextmanager
-def continuous_requests(server: Any, body: bytes) -> Iterator[list[dict[str, Any]]]:
-    """Two clients that ask all the time; every answer must be one."""
-    answers: list[dict[str, Any]] = []
-    failures: list[str] = []
-    end = threading.Event()
-
-    def ask() -> None:
-        while not end.is_set():
-            try:
-                reply = server.post("/poses", body)
-                if reply.status == 200:
-                    answers.append(reply.json)
-                else:
-                    failures.append(f"{reply.status}: {reply.error}")
-            except OSError as error:
-                failures.append(repr(error))
-            time.sleep(0.01)
-
-    clients = [threading.Thread(target=ask) for _ in range(2)]
-    for client in clients:
-        client.start()
-    try:
-        yield answers
-    finally:
-        end.set()
-        for client in clients:
-            client.join()
-    assert not failures
-    assert len(answers) > 10
-
-
 def test_good_bad_good_without_a_failed_request(
-    start_server: Any, make_bundle: Make, make_cloud: Any, npy: Any, tmp_path: Path
+    start_server: Any, continuous_requests: Any, make_bundle: Make, make_cloud: Any, npy: Any, tmp_path: Path
 ) -> None:
     first = make_bundle("first")
     flipped = make_bundle("flipped", graph={"confidence": (0.6, 0.75, 0.3, 0.9)})

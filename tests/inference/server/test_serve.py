@@ -44,6 +44,11 @@ def test_options_that_cannot_work_are_one_sentence(
         (["--deadline-ms", "nan"], "--deadline-ms must be between 1 and 60000, got nan"),
         (["--max-body-mb", "0"], "--max-body-mb must be between 0.001 and 1024, got 0"),
         (["--poll-s", "0"], "--poll-s must be between 0.05 and 3600, got 0"),
+        (["--registry-poll-s", "0"], "--registry-poll-s must be between 0.05 and 3600, got 0"),
+        (
+            ["--registry", "http://mlflow:5000"],
+            "models:/NAME/VERSION, got the path bundle",
+        ),
         (["--threads", "0"], "--threads must be between 1 and 1024, got 0"),
         (["--tls-cert", str(cert)], "--tls-cert and --tls-key must be given together, got one of them"),
         (["--tls-cert", str(cert), "--tls-key", str(tmp_path / "locked.pem")], "must be a PEM certificate and its key"),
@@ -54,6 +59,32 @@ def test_options_that_cannot_work_are_one_sentence(
         line = refused(capsys, *good, *words)
         assert line.startswith("serve: ")
         assert sentence in line
+
+
+def test_a_registry_that_cannot_be_followed_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, trusted_key: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///outputs/mlflow.db")
+    (tmp_path / "file").write_text("no folder")
+    state = ["--key", str(trusted_key), "--state", str(tmp_path / "state")]
+    address = ["--registry", "http://127.0.0.1:9"]
+    for words, sentence in (
+        (["models:/gear/Production", *address], "got 'models:/gear/Production', did you mean models:/gear@champion?"),
+        (["models:/gear@champion"], "must be http://HOST:PORT or https://HOST:PORT, got 'sqlite:///outputs/mlflow.db'"),
+        (["models:/gear@champion", "--registry", "http://cell:hunter2@mlflow"], "must not hold credentials"),
+        (
+            ["models:/gear@champion", *address, "--registry-auth-file", str(tmp_path / "no")],
+            "be readable, but",
+        ),
+        (
+            ["models:/gear@champion", *address, "--key", str(trusted_key), "--state", str(tmp_path / "file" / "state")],
+            "models:/gear@champion needs a state folder to fetch bundles into, but",
+        ),
+    ):
+        line = refused(capsys, *(words if "--state" in words else [*words, *state]))
+        assert line.startswith("serve: ")
+        assert sentence in line
+        assert "hunter2" not in line
 
 
 def test_a_state_folder_and_a_port_belong_to_one_server(

@@ -68,7 +68,7 @@ class Metrics:
             registry=self.registry,
         )  # fmt: skip
         self.registered_as = Gauge(
-            prefix + "registry_info", "The registered version that serves", ["name", "version", "digest"],
+            prefix + "registry_info", "The registered version that serves", ["model", "version", "digest"],
             registry=self.registry,
         )  # fmt: skip
         self.registry_polls = Counter(
