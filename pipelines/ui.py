@@ -11,7 +11,7 @@ import json
 import sys
 
 from attentionvote.tracking.server import serve
-from attentionvote.tracking.store import is_server, resolve_store
+from attentionvote.tracking.store import is_server, resolve_store, shown
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -22,12 +22,12 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         store = resolve_store(options.store)
         if is_server(store):
-            print(json.dumps({"url": store, "store": store}), flush=True)
+            print(json.dumps({"url": store, "store": shown(store)}), flush=True)
             return 0
-        print(f"starting MLflow on {store} ...", file=sys.stderr)
+        print(f"starting MLflow on {shown(store)} ...", file=sys.stderr)
         with serve(store, options.port) as server:
             print(f"open {server.url} (Ctrl-C ends it)", file=sys.stderr)
-            print(json.dumps({"url": server.url, "store": store}), flush=True)
+            print(json.dumps({"url": server.url, "store": shown(store)}), flush=True)
             server.process.wait()
             print("error: the MLflow server ended by itself", file=sys.stderr)
             return 1

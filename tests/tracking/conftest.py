@@ -1,13 +1,27 @@
-"""One store for all (its tables take seconds), a run of its own for each test."""
+"""One store of each kind for all (its tables take seconds), a run of its own for each test."""
+
+import contextlib
 
 import pytest
 
 from attentionvote import tracking
+from attentionvote.tracking.store import connect, experiment_id
+
+EXPERIMENTS = ("rod", "grids")
 
 
 @pytest.fixture(scope="session")
-def store(tmp_path_factory):
-    return f"sqlite:///{tmp_path_factory.mktemp('tracking')}/mlflow.db"
+def store(request, tmp_path_factory):
+    """An SQLite file; parametrised indirectly, another kind.
+
+    The experiments are made elsewhere, because a PostgreSQL's artefacts lie below the working directory then.
+    """
+    uri = request.getfixturevalue("make_session_database")(getattr(request, "param", "sqlite"))
+    client = connect(uri)
+    with contextlib.chdir(tmp_path_factory.mktemp("artefacts")):
+        for name in EXPERIMENTS:
+            experiment_id(client, uri, name)
+    return uri
 
 
 @pytest.fixture

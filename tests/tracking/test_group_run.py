@@ -10,6 +10,7 @@ from attentionvote.tracking.group_run import GROUP_TAG, adopt, open_group
 from attentionvote.tracking.store import connect
 
 
+@pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_the_same_group_is_the_same_run_and_another_is_another(store, tmp_path):
     client = connect(store)
     run = open_group(store, "grids", "lr=1,2", "abc", tags={"grid": "lr=1,2"}, config_yaml="lr: 1\n")
@@ -47,6 +48,7 @@ def test_two_processes_at_once_get_one_run(store):
     assert outputs[0][0] == outputs[1][0]
 
 
+@pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_a_child_is_adopted_once_and_a_lost_one_is_a_warning(store, caplog):
     client = connect(store)
     child = tracking.start_run(store, "rod", system_interval_s=0)

@@ -22,6 +22,7 @@ def client(store):
     return connect(store)
 
 
+@pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_start_run_records_what_it_was_given_and_where_it_comes_from(store, client, tmp_path):
     run = tracking.start_run(
         store, "rod", name="first", params={"lr": 0.001}, config_yaml="lr: 0.001\n", tags={"object": "rod"},
@@ -54,6 +55,7 @@ def test_logging_costs_less_than_a_millisecond_a_step(run):
     assert run.metric_history("train/loss/term_3") == (list(range(200)), [pytest.approx(0.3)] * 200)
 
 
+@pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_resume_keeps_parameters_repairs_status_and_continues_series(store, client, caplog, tmp_path):
     run = tracking.start_run(store, "rod", params={"lr": 1}, config_yaml="a: 1", system_interval_s=0)
     run.log_metrics({"train/loss": 5.0}, 1)
@@ -152,6 +154,7 @@ def test_figure_names_with_a_step_stand_beside_each_other(run, tmp_path):
     assert names == ["step_00000001.png", "step_00000020.png"]
 
 
+@pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_a_run_below_another_one_keeps_its_parent(store, client):
     above, other = (tracking.start_run(store, "grids", name=name, system_interval_s=0) for name in ("above", "other"))
     below = tracking.start_run(store, "rod", system_interval_s=0, parent=above.id)
@@ -162,7 +165,7 @@ def test_a_run_below_another_one_keeps_its_parent(store, client):
     alone.close()
     tracking.start_run(store, "rod", run_id=alone.id, system_interval_s=0, parent=other.id).close()
     assert client.get_run(alone.id).data.tags["mlflow.parentRunId"] == other.id
-    with pytest.raises(ValueError, match=r"parent must name a run in sqlite.*got 'nobody'"):
+    with pytest.raises(ValueError, match=r"parent must name a run in (sqlite|postgresql).*got 'nobody'"):
         tracking.start_run(store, "rod", parent="nobody", system_interval_s=0)
     for run in (above, other):
         run.close()

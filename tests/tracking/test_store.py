@@ -1,15 +1,26 @@
-"""The store: which URI, and several processes on a fresh database at once."""
+"""The store: which URI, no password in what is said, and several processes on a fresh database at once."""
 
-import os
-import sqlite3
 import subprocess
 import sys
-from pathlib import Path
+import threading
+import traceback
+from collections import Counter
 
 import pytest
 
+from attentionvote import tracking
 from attentionvote.tracking.server import free_port
-from attentionvote.tracking.store import artifact_root, connect, experiment_id, resolve_store
+from attentionvote.tracking.store import (
+    artifact_root,
+    connect,
+    exclusive,
+    experiment_id,
+    has_password,
+    resolve_store,
+    shown,
+)
+
+PASSWORD = "swordfish%2F7"
 
 
 def test_resolve_store_prefers_the_argument_then_the_environment_then_outputs(monkeypatch, tmp_path):
@@ -22,6 +33,10 @@ def test_resolve_store_prefers_the_argument_then_the_environment_then_outputs(mo
     assert resolve_store(None) == f"sqlite:///{tmp_path}/outputs/mlflow.db"
     assert artifact_root(resolve_store(None)) == tmp_path / "outputs/mlartifacts"
     assert artifact_root("https://tracking") is None
+    # psycopg2 is what is installed; SQLAlchemy would look for another driver.
+    assert resolve_store("postgresql://me@db/mlflow") == "postgresql+psycopg2://me@db/mlflow"
+    assert resolve_store("postgresql+psycopg://me@db/mlflow") == "postgresql+psycopg://me@db/mlflow"
+    assert artifact_root(resolve_store("postgresql://me@db/mlflow")) == tmp_path / "outputs/mlartifacts"
 
 
 @pytest.mark.parametrize(
@@ -32,11 +47,67 @@ def test_resolve_store_prefers_the_argument_then_the_environment_then_outputs(mo
         ("sqlit:///x.db", "got 'sqlit:///x.db', nearest: 'sqlite://'"),
         ("htps://server", "nearest: 'https://'"),
         ("sqlite://x.db", "must read sqlite:///PATH.db"),
+        ("postgres://me:secret@db/x", r"got 'postgres://me:\*\*\*@db/x', nearest: 'postgresql://'"),
+        ("postgresql://me:secr@t@db/x", r"percent-encoded \(@ is %40\), got 'postgresql://me:\*\*\*@db/x'"),
+        (
+            "https://me:secret@server:5000/",
+            r"must not hold user and password, got 'https://me:\*\*\*@server:5000/': set ",
+        ),
     ],
 )
 def test_resolve_store_rejects_with_the_nearest_choice(store, sentence):
     with pytest.raises(ValueError, match=sentence):
         resolve_store(store)
+
+
+@pytest.mark.parametrize(
+    ("store", "said"),
+    [
+        ("postgresql://me:p:a/s?s#@db:5432/x?sslmode=require", "postgresql://me:***@db:5432/x?sslmode=require"),
+        ("postgresql://me@/x?host=/run&password=p&sslpassword=q", "postgresql://me@/x?host=/run&password=***&sslpassword=***"),
+        ("postgresql://me@db:5432/x", "postgresql://me@db:5432/x"),
+        ("sqlite:////data/mlflow.db", "sqlite:////data/mlflow.db"),
+        ("http://127.0.0.1:5000", "http://127.0.0.1:5000"),
+    ],
+)  # fmt: skip
+def test_shown_hides_passwords_and_nothing_else(store, said):
+    assert shown(store) == said
+    assert has_password(store) == ("***" in said)
+
+
+@pytest.fixture
+def guarded(postgresql, monkeypatch, tmp_path):
+    """URI of an empty PostgreSQL database with the password of the role that owns it, ``guarded``."""
+    monkeypatch.chdir(tmp_path)
+    name = postgresql.create()
+    postgresql.run(f"create role guarded login password '{PASSWORD.replace('%2F', '/')}'")
+    postgresql.run(f"alter database {name} owner to guarded")
+    yield postgresql.uri(name, f"guarded:{PASSWORD}")
+    postgresql.drop(name)
+    postgresql.run("drop role guarded")
+
+
+def test_what_goes_wrong_is_one_sentence_without_the_password(guarded, caplog, capfd):
+    client = connect(guarded)
+    experiment = experiment_id(client, guarded, "rod")
+    assert client.get_experiment(experiment).name == "rod"
+    wrong = {
+        guarded.replace(PASSWORD, "sword%2Ffish"): "cannot be opened: .*password authentication failed for .*guarded",
+        guarded.replace("/test_", "/no_test_"): "cannot be opened: .*database .* does not exist",
+        guarded.replace("?host=", "?host=/nowhere"): "cannot be opened: .*No such file or directory",
+        guarded.replace("?host=", "?port=none&host="): "cannot be opened: .*port",
+    }
+    said = []
+    for uri, sentence in wrong.items():
+        with pytest.raises(ValueError, match=sentence) as caught:
+            connect(uri)
+        assert "guarded:***@" in str(caught.value)
+        assert len(str(caught.value).splitlines()) == 1
+        said += traceback.format_exception(caught.value)  # what goes to outputs/logs
+    with pytest.raises(ValueError, match=r"run_id must name a run in .*guarded:\*\*\*@") as unknown:
+        tracking.start_run(guarded, "rod", run_id="nothing")
+    said += [*traceback.format_exception(unknown.value), caplog.text, *capfd.readouterr()]
+    assert not [text for text in said for secret in ("swordfish", "sword/fish", "sword%2F") if secret in text]
 
 
 def test_connect_names_a_server_that_is_away():
@@ -51,14 +122,14 @@ def test_connect_rejects_a_file_that_is_no_database(tmp_path):
         connect(f"sqlite:///{path}")
 
 
-def test_deleted_experiment_comes_back(tmp_path):
-    uri = resolve_store(str(tmp_path / "mlflow.db"))
-    client = connect(uri)
-    first = experiment_id(client, uri, "rod")
+def test_deleted_experiment_comes_back(database, tmp_path):
+    client = connect(database)
+    first = experiment_id(client, database, "rod")
     client.delete_experiment(first)
-    assert experiment_id(client, uri, "rod") == first
+    assert experiment_id(client, database, "rod") == first
     assert client.get_experiment(first).lifecycle_stage == "active"
-    assert client.get_experiment(first).artifact_location == (tmp_path / "mlartifacts").as_uri()
+    folder = tmp_path / ("mlartifacts" if database.startswith("sqlite") else "outputs/mlartifacts")
+    assert client.get_experiment(first).artifact_location == folder.as_uri()
 
 
 def test_importing_the_package_imports_neither_mlflow_nor_lightning():
@@ -69,23 +140,69 @@ def test_importing_the_package_imports_neither_mlflow_nor_lightning():
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.slow
-def test_processes_may_open_a_fresh_database_at_once(tmp_path):
-    uri = f"sqlite:///{tmp_path}/new/mlflow.db"
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_exclusive_lets_one_in_at_a_time_and_the_next_after_a_kill(kind, request, tmp_path):
+    uri = f"sqlite:///{tmp_path}/x.db" if kind == "sqlite" else request.getfixturevalue("postgresql").uri("postgres")
     code = (
-        "import sys; from attentionvote.tracking import start_run\n"
-        "run = start_run(sys.argv[1], 'rod', system_interval_s=0); run.log_metrics({'x': 1}, 0); run.close()"
+        "import sys; from attentionvote.tracking.store import exclusive\n"
+        "with exclusive(sys.argv[1]): print('in', flush=True); sys.stdin.readline()"
     )
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    processes = [
-        subprocess.Popen([sys.executable, "-c", code, uri], stderr=subprocess.PIPE, text=True, env=environment)
-        for _ in range(3)
-    ]
-    errors = [process.communicate(timeout=120)[1] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0, 0], errors
-    with sqlite3.connect(Path(tmp_path, "new/mlflow.db")) as database:
-        rows = database.execute("select status, count(*) from runs group by status").fetchall()
-        experiments = database.execute("select count(*) from experiments where name = 'rod'").fetchone()
-    database.close()
-    assert rows == [("FINISHED", 3)]
-    assert experiments == (1,)
+    with subprocess.Popen([sys.executable, "-c", code, uri], stdin=-1, stdout=-1, text=True) as holder:
+        assert holder.stdout.readline() == "in\n"
+        entered = threading.Event()
+
+        def enter():
+            with exclusive(uri):
+                entered.set()
+
+        waiting = threading.Thread(target=enter)
+        waiting.start()
+        assert not entered.wait(0.5)
+        holder.kill()
+        waiting.join(timeout=30)
+        assert entered.is_set()
+
+
+# MLflow holds one machine's processes apart by a file below the temporary folder: here each is a machine of its own.
+RACE = """
+import os, sys, tempfile, warnings
+warnings.simplefilter("ignore")
+from attentionvote.tracking import start_run
+from attentionvote.tracking.store import quiet_environment
+quiet_environment()
+import mlflow.store.tracking.sqlalchemy_store, mlflow.server.handlers
+go = os.pipe()
+children = []
+for number in range(4):
+    child = os.fork()
+    if child == 0:
+        tempfile.tempdir = os.path.abspath(f"machine_{number}")
+        os.mkdir(tempfile.tempdir)
+        os.close(go[1])
+        os.read(go[0], 1)  # all start together, when the writing end is closed
+        status = 1
+        try:
+            run = start_run(sys.argv[1], "rod", system_interval_s=0)
+            run.log_metrics({"x": number}, 0)
+            run.close()
+            status = 0
+        except BaseException as error:
+            print(type(error).__name__, error, file=sys.stderr, flush=True)
+        os._exit(status)
+    children.append(child)
+os.close(go[1])
+print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+"""
+
+
+@pytest.mark.slow
+def test_processes_may_open_a_fresh_database_at_once(empty_database):
+    done = subprocess.run(
+        [sys.executable, "-c", RACE, empty_database], capture_output=True, text=True, timeout=200, check=False
+    )
+    assert done.stdout.strip() == "[0, 0, 0, 0]", done.stderr
+    client = connect(empty_database)
+    (experiment,) = [found for found in client.search_experiments() if found.name == "rod"]
+    runs = client.search_runs([experiment.experiment_id])
+    assert Counter(run.info.status for run in runs) == {"FINISHED": 4}
+    assert sorted(run.data.metrics["x"] for run in runs) == [0, 1, 2, 3]

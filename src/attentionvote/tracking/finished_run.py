@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 
 from attentionvote.tracking.metric_writer import metric_name
-from attentionvote.tracking.store import connect, resolve_store
+from attentionvote.tracking.store import connect, resolve_store, shown
 
 
 def add_to_run(
@@ -42,4 +42,4 @@ def add_to_run(
             client.log_text(run_id, text, name)
     except MlflowException as error:
         reason = str(error).strip().split("\n")[0]
-        raise ValueError(f"run {run_id} must be in {uri} to add figures to it, but: {reason}") from error
+        raise ValueError(f"run {run_id} must be in {shown(uri)} to add figures to it, but: {reason}") from error

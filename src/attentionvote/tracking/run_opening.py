@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from attentionvote.tracking import provenance
 from attentionvote.tracking.run import Run, status_of
-from attentionvote.tracking.store import connect, experiment_id, resolve_store
+from attentionvote.tracking.store import connect, experiment_id, resolve_store, shown
 
 if TYPE_CHECKING:
     from mlflow.entities import Run as MlflowRun
@@ -60,7 +60,9 @@ def start_run(
         try:
             return client.get_run(name)
         except MlflowException as error:
-            raise ValueError(f"{argument} must name a run in {uri}, got {name!r}, which it does not have") from error
+            raise ValueError(
+                f"{argument} must name a run in {shown(uri)}, got {name!r}, which it does not have"
+            ) from error
 
     below = {} if parent is None else {PARENT_TAG: known("parent", parent).info.run_id}
     if run_id is None:

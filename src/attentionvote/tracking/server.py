@@ -58,8 +58,9 @@ def serve(store: str | None = None, port: int = 0, timeout_s: float = 90.0) -> I
     # One worker and no job runners: the default starts ten processes with 1.8 GB.
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     environment.pop("MLFLOW_TRACKING_URI", None)
+    environment["MLFLOW_BACKEND_STORE_URI"] = uri  # not an argument: it may hold a password, and `ps` shows those
     command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    command += ["--backend-store-uri", uri, "--artifacts-destination", root.as_uri()]
+    command += ["--artifacts-destination", root.as_uri()]
     url = f"http://127.0.0.1:{port}"
     with tempfile.TemporaryFile() as output:
         # Its own session: the server's children end with it, and Ctrl-C reaches us alone.

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 SERVERS = ("http", "https")
+_CREDENTIALS = "set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
+_DATABASE_PATIENCE_S = 10
+_ADVISORY_LOCK = 0x617474766F7465  # "attvote": one number of ours among everybody's locks in that database
 # Before the import of MLflow: no telemetry, no chatter; a dead server fails within seconds rather than minutes,
 # because our own writers retry in the background anyway. Existing settings of the user win.
 ENVIRONMENT = {
@@ -41,7 +44,8 @@ def resolve_store(store: str | None) -> str:
             SQLite file that ends in ``.db``.
 
     Raises:
-        ValueError: the URI has another scheme, with the nearest valid one.
+        ValueError: the URI has another scheme, with the nearest valid one; a server's address holds a password, or a
+            database's holds one that cannot be told from its host.
     """
     store = store or os.environ.get("MLFLOW_TRACKING_URI") or "outputs/mlflow.db"
     if "://" not in store and not store.startswith(("file:", "sqlite:")) and store.endswith(".db"):
@@ -53,18 +57,39 @@ def resolve_store(store: str | None) -> str:
             raise ValueError(f"an SQLite tracking store must read sqlite:///PATH.db, got {store!r}")
         return f"sqlite:///{Path(path).expanduser().absolute()}"
     if scheme in SERVERS:
+        if "@" in store.split("://", 1)[-1].partition("/")[0]:
+            raise ValueError(
+                f"a tracking server's address must not hold user and password, got {shown(store)!r}: {_CREDENTIALS}"
+            )
         return store.rstrip("/")
     if scheme in DATABASES:
+        if re.match(r"[\w+]+://[^:/?@]*:[^@]*@[^?]*@", store):
+            raise ValueError(
+                f"the password in a tracking store's address must be percent-encoded (@ is %40), got {shown(store)!r}"
+            )
         # SQLAlchemy's own choice is psycopg 3, which nothing here installs.
         return re.sub("^postgresql://", "postgresql+psycopg2://", store)
     if scheme in ("file", ""):
         raise ValueError(
             f"tracking store must be an SQLite file or a server, because MLflow no longer writes folders; "
-            f"got {store!r}, nearest: 'sqlite:///outputs/mlflow.db'"
+            f"got {shown(store)!r}, nearest: 'sqlite:///outputs/mlflow.db'"
         )
     choices = [*DATABASES, *SERVERS]
     near = difflib.get_close_matches(scheme, choices, 1, 0.0)[0]
-    raise ValueError(f"tracking store must start with one of {', '.join(choices)}, got {store!r}, nearest: '{near}://'")
+    raise ValueError(
+        f"tracking store must start with one of {', '.join(choices)}, got {shown(store)!r}, nearest: '{near}://'"
+    )
+
+
+def shown(store: str) -> str:
+    """The store's URI as people and logs may see it: without its password."""
+    store = re.sub(r"^([\w+.-]+://[^:/?@]*):.*@", r"\1:***@", store)
+    return re.sub(r"(?i)([?&][a-z]*(?:password|secret)=)[^&]*", r"\1***", store)
+
+
+def has_password(store: str) -> bool:
+    """Whether the URI holds a password in clear text."""
+    return shown(store) != store
 
 
 def is_server(uri: str) -> bool:
@@ -83,21 +108,34 @@ def artifact_root(uri: str) -> Path | None:
 
 @contextlib.contextmanager
 def exclusive(uri: str) -> Iterator[None]:
-    """One process at a time at an SQLite store, whose first touch by MLflow is not safe for several; not re-entrant.
+    """One process at a time at a store whose first touch by MLflow is not safe for several; not re-entrant.
 
-    A server or another database is not held.
+    An SQLite file is held by a lock beside it, PostgreSQL by a lock of its own, which it releases when a process or
+    its machine dies. A server and other databases are not held.
+
+    Raises:
+        Exception: SQLAlchemy's, when PostgreSQL cannot be reached.
     """
-    if not uri.startswith("sqlite:///"):
-        yield
-        return
-    path = Path(uri.removeprefix("sqlite:///"))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.with_name(path.name + ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel even on kill -9
+    if uri.startswith("sqlite:///"):
+        path = Path(uri.removeprefix("sqlite:///"))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.with_name(path.name + ".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel even on kill -9
+            yield
+    elif uri.startswith("postgresql"):
+        from sqlalchemy import create_engine, text
+        from sqlalchemy.pool import NullPool
+
+        engine = create_engine(uri, poolclass=NullPool, connect_args={"connect_timeout": _DATABASE_PATIENCE_S})
+        # Of a transaction rather than a session: it also holds behind a pooler such as PgBouncer.
+        with engine.begin() as connection:
+            connection.execute(text("select pg_advisory_xact_lock(:key)"), {"key": _ADVISORY_LOCK})
+            yield
+    else:
         yield
 
 
-def _check_server(uri: str) -> None:
+def _check_health(uri: str) -> None:
     try:
         with urllib.request.urlopen(f"{uri}/health", timeout=10):
             pass
@@ -115,6 +153,25 @@ def _check_server(uri: str) -> None:
         ) from error
 
 
+def _check_access(client: MlflowClient, uri: str) -> None:
+    """/health is open to everybody: ask something that only users are told."""
+    from mlflow.exceptions import MlflowException
+    from mlflow.utils.credentials import read_mlflow_creds
+
+    try:
+        client.search_experiments(max_results=1)
+    except MlflowException as error:
+        status = error.get_http_status_code()
+        if status not in (401, 403):
+            sentence = str(error).strip().splitlines()[0]
+            raise ConnectionError(f"tracking server {uri} must answer as MLflow does, got: {sentence}") from error
+        user = read_mlflow_creds().username
+        known = f", it refuses those of {user!r} (HTTP {status})" if user else f" (HTTP {status})"
+        raise ConnectionError(
+            f"tracking server {uri} must be given user and password{known}: {_CREDENTIALS}"
+        ) from error
+
+
 def quiet_environment() -> None:
     """Set MLflow's switches that must be set before its import."""
     for name, value in ENVIRONMENT.items():
@@ -122,14 +179,14 @@ def quiet_environment() -> None:
 
 
 def connect(uri: str) -> MlflowClient:
-    """A client of the store; creates an SQLite file and its tables, safely when several processes do so at once.
+    """A client of the store; creates a database's tables, safely when several processes do so at once.
 
     Raises:
-        ConnectionError: a server does not answer.
+        ConnectionError: a server does not answer, or wants other credentials than it was given.
         ValueError: the store cannot be used (for example tables of another MLflow version).
     """
     if is_server(uri):
-        _check_server(uri)
+        _check_health(uri)
     quiet_environment()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # MLflow's dependencies deprecate each other at import
@@ -138,17 +195,20 @@ def connect(uri: str) -> MlflowClient:
     # One sentence of ours says that a server is away; urllib3 and alembic would add a page.
     for name in ("urllib3.connectionpool", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    with exclusive(uri), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
-        try:
-            return MlflowClient(uri, registry_uri=uri)
-        except MlflowException as error:
-            sentence = str(error).strip().splitlines()[0]
-            hint = f"; try `mlflow db upgrade {uri}`" if "schema" in sentence else ""
-            raise ValueError(f"tracking store {uri} cannot be used: {sentence}{hint}") from error
-        except Exception as error:  # SQLAlchemy's, for a file that is no database or cannot be opened
-            sentence = str(error).strip().splitlines()[0]
-            raise ValueError(f"tracking store {uri} cannot be opened: {sentence}") from error
+    try:
+        with exclusive(uri), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
+            client = MlflowClient(uri, registry_uri=uri)
+    except MlflowException as error:
+        sentence = str(error).strip().splitlines()[0]
+        hint = f"; try `mlflow db upgrade {shown(uri)}`" if "schema" in sentence else ""
+        raise ValueError(f"tracking store {shown(uri)} cannot be used: {sentence}{hint}") from error
+    except Exception as error:  # SQLAlchemy's, for what is no database, is away or lets us not in
+        sentence = str(error).strip().splitlines()[0]
+        raise ValueError(f"tracking store {shown(uri)} cannot be opened: {sentence}") from error
+    if is_server(uri):
+        _check_access(client, uri)
+    return client
 
 
 def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
