@@ -1,0 +1,134 @@
+"""The leaderboard of a fleet: what is known of every part's model, as rows, as a table, as files."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from json_files import write_json
+from training_job import TrainingJob
+
+from attentionvote.inference import BundleError, load_bundle
+from attentionvote.simulation import SceneSet, scene_set_directory
+
+log = logging.getLogger("attentionvote.fleet")
+_HEAD = ("part", "AP 10 %", "AP 5 %", "AP 2 %", "95 % of AP 10 %", "p50", "champion", "stale data", "state")
+
+
+def row(name: str, job: TrainingJob, answers: Mapping[str, Any], bundles: Path, root: Path, store: str | None) -> dict:
+    """What is known of a part's model.
+
+    Args:
+        name: of the part.
+        job: the training that the configuration means now.
+        answers: of the verbs, see ``MemberTask``.
+        bundles: where exports lie.
+        root: where scene sets lie.
+        store: of MLflow.
+    """
+    evaluated = answers.get("evaluate") or {}
+    bundle = bundles / name / "latest"
+    known: dict[str, Any] = {"object": name, "seconds": answers.get("seconds")}
+    known |= {key: evaluated.get("figures", {}).get(key) for key in ("ap_10", "ap_5", "ap_2", "latency_p50_ms")}
+    known["intervals"] = {key: evaluated.get("intervals", {}).get(key) for key in ("ap_10", "ap_5", "ap_2")}
+    known["bundle"], known["stale"] = None, []
+    try:
+        loaded = load_bundle(bundle, None)
+        known["bundle"] = loaded.digest
+        known["stale"] = stale_splits(loaded.card.data, job, root)
+    except BundleError:
+        pass  # nothing exported yet
+    known["champion"] = _champion(store, name)
+    known["failed"] = f"{answers['failed']}: {answers['sentence']}" if answers.get("failed") else None
+    return known
+
+
+def stale_splits(trained_with: Mapping[str, str], job: TrainingJob, root: Path) -> list[str]:
+    """Splits whose scenes are not those that the current configuration would generate.
+
+    Args:
+        trained_with: content digest of every split's scene set, from a model card.
+        job: the training that the configuration means now.
+        root: where scene sets lie; a set that is not there was never generated.
+    """
+    stale = []
+    for split, spec in job.specs.items():
+        directory = scene_set_directory(root / "scenes", job.part.name, spec)
+        now = SceneSet.open(directory).digest if SceneSet.is_complete(directory) else None
+        if trained_with.get(split) != now:
+            stale.append(split)
+    return stale
+
+
+def _champion(store: str | None, name: str) -> dict[str, Any] | None:
+    """Version, age and bundle of the champion; None when there is none, or no registry."""
+    from attentionvote.registry.versions import Versions
+
+    try:
+        champion = Versions(store, name).champion()
+    except (ValueError, OSError) as error:
+        log.warning("the champion of %s is not known: %s", name, error)
+        return None
+    if champion is None:
+        return None
+    age_days = (time.time() - champion.created_s) / 86_400
+    return {"version": champion.number, "age_days": round(age_days, 2), "bundle": champion.digest}
+
+
+def cells(known: Mapping[str, Any]) -> list[str]:
+    """A row as texts, in the order of the table's columns."""
+    champion, sure = known["champion"], known["intervals"]["ap_10"]
+    if champion is None:
+        told = "none"
+    else:
+        other = "" if champion["bundle"] == known["bundle"] else ", another bundle"
+        told = f"version {champion['version']}, {champion['age_days']:.0f} d{other}"
+    figures = [known[name] for name in ("ap_10", "ap_5", "ap_2")]
+    return [
+        known["object"],
+        *("" if value is None else f"{value:.3f}" for value in figures),
+        "" if sure is None else f"{sure[0]:.3f} to {sure[1]:.3f}",
+        "" if known["latency_p50_ms"] is None else f"{known['latency_p50_ms']:.0f} ms",
+        told,
+        "" if known["bundle"] is None else ", ".join(known["stale"]) or "no",
+        known["failed"] or "done",
+    ]
+
+
+def best_first(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Parts by AP at 2 %, then 5 %, then 10 % D; those without figures last."""
+
+    def order(known: Mapping[str, Any]) -> tuple[float, ...]:
+        return tuple(-1.0 if known[name] is None else known[name] for name in ("ap_2", "ap_5", "ap_10"))
+
+    return sorted(rows, key=order, reverse=True)
+
+
+def show(rows: Sequence[Mapping[str, Any]]) -> None:
+    """The table on stderr."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{len(rows)} parts", title_justify="left", box=None, pad_edge=False)
+    for name in _HEAD:
+        table.add_column(name, overflow="fold")
+    for known in rows:
+        table.add_row(*cells(known))
+    Console(stderr=True).print(table)
+
+
+def write(folder: Path, rows: Sequence[dict[str, Any]], left_out: Mapping[str, str]) -> Path:
+    """leaderboard.md and leaderboard.json; the path of the first."""
+    lines = ["# Fleet", "", f"| {' | '.join(_HEAD)} |", f"|{'---|' * len(_HEAD)}"]
+    lines += [f"| {' | '.join(cell.replace('|', '/') for cell in cells(known))} |" for known in rows]
+    if left_out:
+        lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in left_out.items())]
+    place = folder / "leaderboard.md"
+    temporary = folder / ".leaderboard.md"
+    temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    temporary.replace(place)
+    write_json(folder / "leaderboard.json", {"members": list(rows), "left_out": dict(left_out)})
+    return place

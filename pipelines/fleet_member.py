@@ -1,0 +1,48 @@
+"""One part of a fleet: trained, exported, evaluated by the verbs themselves, each in a process of its own."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from job_process import JobProcess
+
+VERBS = ("train", "export", "evaluate")
+SCRIPTS = Path(__file__).resolve().parent
+
+
+@dataclass(frozen=True)
+class MemberTask:
+    """Runs the verbs of a part; the task that the executor takes to its workers.
+
+    Args:
+        words: of every verb.
+        logs: folder for what the verbs say; None shows it here.
+    """
+
+    words: dict[str, tuple[str, ...]]
+    logs: Path | None
+
+    def __call__(self, name: str) -> dict[str, Any]:
+        """What the verbs answered, by verb; ``failed`` names the verb that did not, ``sentence`` says why."""
+        start = time.monotonic()
+        answers: dict[str, Any] = {}
+        for verb in VERBS:
+            # The training that these words mean, not the newest one.
+            chosen = [f"run={answers['train']['run_id']}"] if verb == "export" else []
+            outcome = self._run(verb, [f"object={name}", *self.words[verb], *chosen], name)
+            if outcome.result is None:
+                answers |= {"failed": verb, "sentence": outcome.sentence}
+                break
+            answers[verb] = outcome.result
+        return answers | {"seconds": round(time.monotonic() - start, 1)}
+
+    def _run(self, verb: str, words: list[str], name: str) -> Any:
+        script = SCRIPTS / f"{verb}.py"
+        if self.logs is None:
+            return JobProcess(script, words).wait()
+        self.logs.mkdir(parents=True, exist_ok=True)
+        with (self.logs / f"{name}-{verb}.log").open("ab") as log:
+            return JobProcess(script, words, stderr=log).wait()
