@@ -15,6 +15,7 @@ from attentionvote.inference.bundle import load_bundle
 from attentionvote.inference.command_line import main
 
 Make = Callable[..., Path]
+pytestmark = pytest.mark.slow  # the first one starts an MLflow server
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:

@@ -25,6 +25,7 @@ from attentionvote.inference.registry_reference import RegistryVersion, parse_re
 from attentionvote.inference.signature import load_public_key, make_keys
 
 Make = Callable[..., Path]
+pytestmark = pytest.mark.slow  # the first one starts an MLflow server
 
 
 class Cell:

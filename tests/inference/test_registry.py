@@ -20,6 +20,7 @@ from attentionvote.inference.registry_access import Access
 from attentionvote.inference.registry_reference import RegistryVersion, parse_reference
 
 Make = Callable[..., Path]
+pytestmark = pytest.mark.slow  # the first one starts an MLflow server
 
 
 def resolved(url: str, reference: str, **access: Any) -> RegistryVersion:

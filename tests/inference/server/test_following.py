@@ -18,6 +18,7 @@ from attentionvote.inference.fetched_bundles import FetchedBundles
 from attentionvote.inference.registry import Registry
 from attentionvote.inference.registry_access import Access
 from attentionvote.inference.registry_reference import parse_reference
+from attentionvote.inference.server import health
 from attentionvote.inference.server.bundle_loading import BundleLoader
 from attentionvote.inference.server.following import Following
 from attentionvote.inference.server.metrics import Metrics
@@ -26,6 +27,7 @@ from attentionvote.inference.server.serving import Serving
 from attentionvote.inference.signature import load_private_key, load_public_key, make_keys
 
 Make = Callable[..., Path]
+pytestmark = pytest.mark.slow  # the first one starts an MLflow server
 QUICK = ("--registry-poll-s", "0.1")
 # Another confidence is another bundle, and its answers can be told apart.
 CONFIDENCE = {"1": (0.7, 0.95, 0.3, 0.99), "2": (0.7, 0.9, 0.3, 0.99), "3": (0.7, 0.85, 0.3, 0.99)}
@@ -51,7 +53,6 @@ def registry_log(server: Any, level: str) -> list[str]:
     return [line["message"] for line in server.log("registry") if line["level"] == level]
 
 
-@pytest.mark.slow
 def test_promoted_rolled_back_and_alone(
     own_registry: Any,
     start_server: Any,
@@ -85,9 +86,11 @@ def test_promoted_rolled_back_and_alone(
     server.wait_until(lambda: server.metric("registry_polls_total", outcome="away") >= 3, "it has noticed")
     assert server.metric("registry_failing") == 1
     assert server.post("/poses", body).json["model"] == first
-    (said,) = registry_log(server, "error")  # once, however often it asked
-    assert "cannot be reached: Connection refused; bracket" in said
-    assert server.post("/v2/repository/index").json[0]["reason"] == said.partition(";")[0]
+    refused = f"the registry {own_registry.url} cannot be reached: Connection refused"
+    server.wait_until(lambda: server.post("/v2/repository/index").json[0]["reason"] == refused, "the index says why")
+    said = registry_log(server, "error")
+    assert len(said) == len(set(said)) <= 2  # once each, however often it asked; the first may be a cut connection
+    assert f"{refused}; bracket {first} goes on serving" in said
     assert server.stop() == 0
 
     server = start_server(f"models:/{name}@champion", *options)
@@ -104,18 +107,20 @@ def test_promoted_rolled_back_and_alone(
     server.wait_until(lambda: server.metric("registry_polls_total", outcome="away") >= 2, "it has asked")
     time.sleep(0.3)
     assert server.get("/v2/health/ready").status == 503
-    server.wait_until(lambda: "no last known good" in server.get("/v2/health/ready").error, "it says what it lacks")
-    assert "cannot be reached: Connection refused, and" in server.get("/v2/health/ready").error
+    assert "cannot be reached: Connection refused" in server.get("/v2/health/ready").error
     assert len(list((state / "kept").iterdir())) == 2
 
 
 def test_a_pin_never_moves_and_asks_nobody_once_it_is_here(
-    gate: Any, real_registry: Any, start_server: Any, bundles: Any
+    gate: Any, real_registry: Any, start_server: Any, bundles: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = real_registry.new_name()
     real_registry.register(name, bundles["1"])
     server = start_server(f"models:/{name}/1", "--registry", gate.url, *QUICK)
     assert registered(server) == {"name": name, "version": "1"}
+    assert server.get("/").json["model"]["registry"] == {"name": name, "version": "1"}
+    assert health.main(["--url", server.url]) == 0
+    assert capsys.readouterr().out == f"ready: bracket {server.version()}, version 1 of {name}\n"
     asked = len(gate.asked)
     real_registry.register(name, bundles["2"])
     polls = server.metric("registry_polls_total", outcome="answered")

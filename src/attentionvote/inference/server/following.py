@@ -61,7 +61,8 @@ class Following:
         self._told: set[str] = set()
         self._away_s = poll_s
         self._refused: RegistryVersion | None = None
-        self._refusal, self._retry_s, self._retry_at = "", poll_s, 0.0
+        self._refusal: Exception | None = None
+        self._retry_s, self._retry_at = poll_s, 0.0
         self._watching = False
         self._lock = asyncio.Lock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="registry", initializer=be_polite)
@@ -75,10 +76,13 @@ class Following:
     async def run(self) -> None:
         """Follow until cancelled."""
         first = asyncio.ensure_future(self._step())
-        if not self._bundles.link.is_dir():  # a first start: a moment later there may be a bundle
-            await asyncio.wait({first}, timeout=self._patience_s)
-        self._watching = True
-        await asyncio.gather(self._watch.run(), self._follow(first))
+        try:
+            if not self._bundles.link.is_dir():  # a first start: a moment later there may be a bundle
+                await asyncio.wait({first}, timeout=self._patience_s)
+            self._watching = True
+            await asyncio.gather(self._watch.run(), self._follow(first))
+        finally:
+            first.cancel()
 
     async def check(self) -> str | None:
         """Ask now, look at the link now, and say why it does not serve (None: it does)."""
@@ -162,15 +166,15 @@ class Following:
             return False  # a pin that is here needs no registry
         version = self._registry.resolve(self._bundles.reference)
         if version != self._refused:
-            self._refused, self._refusal, self._retry_s = version, "", self._poll_s
-        elif self._refusal and time.monotonic() < self._retry_at:
-            raise BundleError(self._refusal)  # known already, and not fetched again so soon
+            self._refused, self._refusal, self._retry_s = version, None, self._poll_s
+        elif self._refusal is not None and time.monotonic() < self._retry_at:
+            raise self._refusal.with_traceback(None)  # known already, and not fetched again so soon
         try:
             folder, fetched = self._bundles.take(self._registry, version, serving)
         except RegistryError:
             raise
-        except BundleError as error:
-            self._refusal, self._retry_at = str(error), time.monotonic() + self._retry_s
+        except (BundleError, OSError) as error:
+            self._refusal, self._retry_at = error, time.monotonic() + self._retry_s
             self._retry_s = min(2 * self._retry_s, _LONGEST_RETRY_S)
             raise
         self._refused = None
