@@ -30,10 +30,10 @@ def main() -> int:
     except SignalException as ended:
         return 130 if ended.sigval == signal.SIGINT else 128 + int(ended.sigval)
     except ChildFailedError as error:
-        _, first = error.get_first_failure()
+        rank, first = error.get_first_failure()
         if first.exitcode < 0:
             name = signal.Signals(-first.exitcode).name
-            print(f"train: process {first.global_rank + 1} was ended by {name}", file=sys.stderr)
+            print(f"train: process {rank + 1} was ended by {name}", file=sys.stderr)
             return 128 - first.exitcode
         return first.exitcode
     return 0

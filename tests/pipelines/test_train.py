@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import logging
 import os
@@ -373,18 +374,16 @@ def test_ctrl_c_during_training(words: list[str], tmp_path: Path, store: str, ve
     assert connect(resolve_store(store)).get_run(run_id).info.status == "KILLED"
 
 
-@pytest.mark.parametrize("moment", ["measure_clouds", "assess"])
+@pytest.mark.parametrize(("module", "moment"), [("training_data", "measure_clouds"), ("training_run", "assess")])
 @CHEAP
 def test_ctrl_c_at_other_moments(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, moment: str
 ) -> None:
-    import training_run
-
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(training_run, moment, interrupt)
+        patch.setattr(importlib.import_module(module), moment, interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(words)
     folder = job_folder(tmp_path)

@@ -1,0 +1,250 @@
+"""One training on several processes, started by the real torchrun: what it comes to, who speaks, what ends it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import train
+from configuration import ConfigurationError, compose
+from training_processes import Place, refuse_grid
+
+ROOT = Path(__file__).resolve().parents[2]
+# Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
+# rounding then stay what they are for a while.
+WORDS = [
+    "object=brick", "experiment=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2,3]", "workers=1",
+    "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=4",
+    "trainer.validate_every=2", "trainer.threads=1", "trainer.average_decay=0.5", "trainer.precision=32-true",
+    "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1", "trainer.schedule.ramp_steps=1", "force=false",
+    "trainer.learning_rate=0.001", "trainer.peak_threshold=0.0", "trainer.train_heat=0.0",
+    "loss.settings.assignment=0.6", "tracking.system_interval=0", "model.centers=[64,32,16,8]",
+    "model.neighbors=[8,8,8,8]", "model.widths=[[8,16],[16,16],[16,16],[16,16]]", "model.propagation=[16,16]",
+    "model.voting=[16]", "model.fusion=[16,16]", "model.head=[16]", "model.refinement.points=16",
+    "model.refinement.widths=[8,16]", "model.refinement.head=[16]",
+]  # fmt: skip
+TORCHRUN_SAYS = {
+    "RANK": "1", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "none"
+}  # fmt: skip
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts a training on so many processes; what still runs when the test ends is killed."""
+    with ExitStack() as stack:
+
+        def begin(processes: int, words: list[str], **environment: str) -> subprocess.Popen[str]:
+            several = ["pipelines/start_processes.py", "--standalone", f"--nproc-per-node={processes}"]
+            process = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, *(several if processes > 1 else []), "pipelines/train.py", *words],
+                    cwd=ROOT,
+                    text=True,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    env={**os.environ, **environment},
+                )
+            )
+            stack.callback(process.kill)
+            return process
+
+        yield begin
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[str]], dict[str, Any]]]:
+    """Trains in this process, which has imported everything already; without figures, each of which takes a second."""
+    import torch
+
+    from attentionvote.tracking import figures, scene_pictures
+
+    for module in (scene_pictures, figures):
+        for name in ("scene_picture", "loss_figure", "precision_recall_figure", "ap_threshold_figure"):
+            monkeypatch.setattr(module, name, lambda *_, **__: b"picture", raising=False)
+    threads, level = torch.get_num_threads(), logging.getLogger("lightning.pytorch").level
+    yield lambda words: json.loads(json.dumps(train.run(compose("train", words))))
+    torch.set_num_threads(threads)
+    logging.getLogger("lightning.pytorch").setLevel(level)
+
+
+def test_torchrun_s_environment_is_understood() -> None:
+    assert Place.of({}) == Place.of({"WORLD_SIZE": "1", "RANK": "0"}) == Place()
+    place = Place.of(TORCHRUN_SAYS)
+    assert (place.rank, place.processes, place.local_rank, place.local_processes) == (1, 4, 1, 2)
+    assert place.name == "process 2 of 4"
+    assert place.trainer_arguments()["num_nodes"] == 2
+    assert Place().trainer_arguments() == {"devices": 1}
+    for name in ("RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID"):
+        with pytest.raises(ConfigurationError, match=f"must be started by torchrun, but WORLD_SIZE is 4 and {name} is"):
+            Place.of({k: v for k, v in TORCHRUN_SAYS.items() if k != name})
+    with pytest.raises(ConfigurationError, match="2 on this one are no equal share of 3"):
+        Place.of(TORCHRUN_SAYS | {"WORLD_SIZE": "3"})
+
+
+def test_what_cannot_be_shared_is_refused() -> None:
+    place, scenes = Place.of(TORCHRUN_SAYS), {"train": 100, "val": 7, "test": 4}
+    place.check(16, scenes)
+    for batch, nearest in ((15, 16), (17, 16), (1, 4)):
+        with pytest.raises(ValueError, match=f"multiple of their number, 4; got {batch}, {nearest} is the nearest"):
+            place.check(batch, scenes)
+    with pytest.raises(ValueError, match="processes must be at most the 3 test scenes, got 4"):
+        place.check(16, scenes | {"test": 3})
+    with pytest.raises(ConfigurationError, match=r"a grid \(-m\) must be run by one process, got 4"):
+        refuse_grid(place, ["train.py", "-m", "seed=1,2"])
+    refuse_grid(Place(), ["train.py", "-m", "seed=1,2"])
+    refuse_grid(place, ["train.py", "seed=1"])
+
+
+def test_a_refusal_is_said_once_a_machine_and_at_once(start: Start, tmp_path: Path) -> None:
+    def said(rank: int, local_rank: int, *words: str) -> str:
+        place = TORCHRUN_SAYS | {"RANK": str(rank), "LOCAL_RANK": str(local_rank)}
+        process = start(1, [*WORDS, f"outputs={tmp_path}", *words], **place)
+        out, err = process.communicate(timeout=60)
+        assert (process.returncode, out) == (2, "")
+        return err
+
+    batch = "trainer.batch_size is shared by all processes and must be a multiple of their number, 4; got 6, 8 is the"
+    assert said(0, 0, "trainer.batch_size=6").startswith(f"train: {batch}")
+    assert said(1, 1, "trainer.batch_size=6") == ""
+    assert said(2, 0, "trainer.batch_size=6").startswith(f"train: process 3 of 4: {batch}")
+    assert said(3, 1, "trainer.max_epoch=3") == ""
+    assert "a grid (-m) must be run by one process" in said(0, 0, "-m", "seed=1,2")
+    assert not list(tmp_path.iterdir())
+
+
+def curves(database: Path, run_id: str) -> dict[str, list[tuple[int, float]]]:
+    """All metrics of a run, row by row: a step that was logged twice is there twice."""
+    with sqlite3.connect(database) as store:
+        rows = store.execute("select key, step, value from metrics where run_uuid = ? order by step", (run_id,))
+        found: dict[str, list[tuple[int, float]]] = {}
+        for name, step, value in rows:
+            found.setdefault(name, []).append((step, value))
+    store.close()
+    return found
+
+
+def runs(database: Path) -> list[str]:
+    with sqlite3.connect(database) as store:
+        found = [row[0] for row in store.execute("select run_uuid from runs order by start_time")]
+    store.close()
+    return found
+
+
+def artifacts(database: Path, run_id: str) -> set[str]:
+    folder = database.parent / "mlartifacts" / run_id / "artifacts"
+    ignored = ("resume_", "uncommitted")  # other helpers of a developer may touch the working tree meanwhile
+    names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    return {name for name in names if not name.startswith(ignored)}
+
+
+def assert_same_training(one: dict[str, Any], other: dict[str, Any], database: Path) -> None:
+    """Curves, figures and weights agree, but for what rounding grows to."""
+    import torch
+
+    early, late = 0.0, 0.0
+    a, b = curves(database, one["run_id"]), curves(database, other["run_id"])
+    assert set(a) == set(b)
+    for name, rows in a.items():
+        if name == "epoch":  # Lightning adds it to every call, to two of one step after a validation
+            continue
+        assert [step for step, _ in rows] == [step for step, _ in b[name]] == sorted({step for step, _ in rows}), name
+        for (step, x), (_, y) in zip(rows, b[name], strict=True):
+            if not name.startswith("train/"):
+                assert y == pytest.approx(x, abs=1e-3), name
+            elif step < 6:
+                early = max(early, abs(x - y) / max(abs(x), 1e-3))
+            else:
+                late = max(late, abs(x - y) / max(abs(x), 1e-3))
+    print(f"largest relative difference of a loss: {early:.1e} in the first half, {late:.1e} in the second")
+    assert early < 1e-4
+    assert late < 2e-2
+    assert len(a["train/loss/vote"]) == 12
+    assert len(a["val/ap"]) == 2
+    assert one["metrics"] == pytest.approx(other["metrics"], abs=1e-3)
+    assert (one["steps"], one["test_scenes"]) == (other["steps"], other["test_scenes"]) == (12, 3)
+    ends = [torch.load(Path(r["checkpoint"]).with_name("last.ckpt"), weights_only=True) for r in (one, other)]
+    for key in ("state_dict", "current_model_state"):  # averaged, and of the last step
+        # All together: Adam makes whole steps of the rounding in the gradient of a bias before a norm, which is zero.
+        floats = [[v.flatten() for v in end[key].values() if v.is_floating_point()] for end in ends]
+        flat = [torch.cat(values).double() for values in floats]
+        apart = float((flat[1] - flat[0]).norm() / flat[0].norm())
+        print(f"relative distance of all weights, {key}: {apart:.1e}")
+        assert apart < 2e-2
+    assert artifacts(database, one["run_id"]) == artifacts(database, other["run_id"])
+
+
+def until(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not ready():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def child_of_rank(torchrun: int, rank: int) -> int:
+    for child in Path(f"/proc/{torchrun}/task/{torchrun}/children").read_text().split():
+        if f"\0RANK={rank}\0" in Path(f"/proc/{child}/environ").read_text():
+            return int(child)
+    raise AssertionError(f"no child of rank {rank}")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_two_processes_train_what_one_trains_whatever_interrupts_them(
+    start: Start, alone: Callable[[list[str]], dict[str, Any]], tmp_path: Path
+) -> None:
+    database = tmp_path / "mlflow.db"
+    common = [*WORDS, f"root={tmp_path / 'data'}", f"tracking.store={database}"]
+    process = start(2, [*common, f"outputs={tmp_path / 'two'}"])  # the first process makes the data
+    out, err = process.communicate(timeout=250)
+    assert process.returncode == 0, err
+    assert out.count("\n") == 1
+    two = json.loads(out)
+    assert err.count("brick: 12/3/3 scenes") == 1
+    assert err.count("AP ") == len(err.splitlines()) - err.count("brick") == 3, err  # two validations and the end
+    assert "1 thread in each of 2 processes" in err
+    folder = tmp_path / "two" / "brick"
+    (training,) = folder.iterdir()
+    assert {p.name for p in training.iterdir()} == {".lock", "checkpoints", "model.ckpt", "result.json", "run.json"}
+    assert runs(database) == [two["run_id"]]
+
+    one = alone([*common, f"outputs={tmp_path / 'one'}"])
+    assert Path(one["model"]).parent.name == training.name  # the same training, whoever does it
+    assert_same_training(one, two, database)
+
+    # Ctrl-C, then kill -9 of one process, then the rest in one process.
+    words = [*common, f"outputs={tmp_path / 'cut'}"]
+    last = tmp_path / "cut" / "brick" / training.name / "checkpoints" / "last.ckpt"
+    process = start(2, words)
+    until(process, last.exists)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=40)
+    assert (process.returncode, out) == (130, "")
+    assert err.count("train: ") == err.count("train: interrupted; run the same command to resume") == 1
+    assert "Traceback" not in err
+    before = last.stat().st_mtime_ns
+    process = start(2, words)
+    until(process, lambda: last.stat().st_mtime_ns > before)
+    os.kill(child_of_rank(process.pid, 1), signal.SIGKILL)
+    out, err = process.communicate(timeout=40)
+    assert (process.returncode, out) == (137, "")
+    assert "going on after an interruption" in err
+    assert err.count("train: process 2 was ended by SIGKILL") == 1
+    # What reaches the first process first: the broken connection, or torchrun's SIGTERM, which needs no words.
+    assert err.count("train: ") - 1 == err.count("train: another process of this training has ended; run the same")
+    assert "Traceback" not in err
+    assert_same_training(one, alone(words), database)
+    assert len(runs(database)) == 3
