@@ -121,7 +121,7 @@ def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfi
     for override in values:
         key = override.key_or_group
         if not (override.is_add() or override.is_delete()):
-            _check_types(key, _select(base, key), _select(final, key))
+            check_types(key, _select(base, key), _select(final, key))
     for key, value in leaves(final):
         problem = violation(key, value)
         if problem:
@@ -204,7 +204,7 @@ def _select(plain: Any, key: str) -> Any:
     return node
 
 
-def _check_types(key: str, default: Any, value: Any) -> None:
+def check_types(key: str, default: Any, value: Any) -> None:
     """Refuse ``value`` where it has another type than ``default``; null as a default accepts anything.
 
     Null as a value is for settings that say their type in the table of ranges: these mean something without one.
@@ -216,7 +216,7 @@ def _check_types(key: str, default: Any, value: Any) -> None:
             raise ConfigurationError(f"{key} must be a section with keys {', '.join(map(str, default))}; got {value!r}")
         for name in value:
             if name in default:
-                _check_types(f"{key}.{name}", default[name], value[name])
+                check_types(f"{key}.{name}", default[name], value[name])
         return
     if isinstance(default, list):
         if not isinstance(value, list):
@@ -224,7 +224,7 @@ def _check_types(key: str, default: Any, value: Any) -> None:
         if default and not value:
             raise ConfigurationError(f"{key} must not be empty, a list such as {default}; got []")
         for index, item in enumerate(value if default else ()):
-            _check_types(f"{key}[{index}]", default[min(index, len(default) - 1)], item)
+            check_types(f"{key}[{index}]", default[min(index, len(default) - 1)], item)
         return
     problem = type_problem(default, value)
     if problem:

@@ -1,8 +1,9 @@
 """One job in a process of its own, and both ends of it: what it answers comes back whole, it ends with its starter.
 
 A job is a verb's script with its words: a crash costs one job, and its memory is freed when it ends. The job
-leaves its JSON line and, when it fails, its sentence in files; two variables of the environment tell it so:
-``ATTENTIONVOTE_JOB_PARENT`` (the process id it ends with) and ``ATTENTIONVOTE_JOB_FAILURE`` (the file).
+leaves its JSON line and, when it fails, its sentence in files without names, so that a kill -9 leaves nothing behind.
+Two variables of the environment tell it so: ``ATTENTIONVOTE_JOB_PARENT`` (the process id it ends with) and
+``ATTENTIONVOTE_JOB_FAILURE`` (the descriptor of the file).
 """
 
 from __future__ import annotations
@@ -52,20 +53,23 @@ class JobProcess:
         stderr: IO[Any] | None = None,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="attentionvote-job-")
-        self._failure = Path(self._folder.name) / "failure"
-        self._stdout = Path(self._folder.name) / "stdout"
-        own = {PARENT: str(os.getpid()), FAILURE: str(self._failure)}
-        with self._stdout.open("wb") as stdout:
+        self._outcome: Outcome | None = None
+        self._stdout, self._failure = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
+        own = {PARENT: str(os.getpid()), FAILURE: str(self._failure.fileno())}
+        try:
             # A session of its own: Ctrl-C reaches us alone, and we pass it on, once.
             self._process = subprocess.Popen(
                 [sys.executable, str(script), *words],
                 stdin=subprocess.DEVNULL,
-                stdout=stdout,
+                stdout=self._stdout,
                 stderr=stderr,
                 env={**os.environ, **(environment or {}), **own},
+                pass_fds=[self._failure.fileno()],
                 start_new_session=True,
             )
+        except BaseException:
+            self._close()
+            raise
 
     @property
     def pid(self) -> int:
@@ -75,38 +79,57 @@ class JobProcess:
     def poll(self) -> Outcome | None:
         """How the job ended, None while it runs."""
         code = self._process.poll()
-        if code is None:
-            return None
-        return self._outcome(code)
+        if code is not None and self._outcome is None:
+            self._outcome = self._read(code)
+            self._close()
+        return self._outcome
 
     def wait(self) -> Outcome:
         """Wait for the end; KeyboardInterrupt is passed on to the job and raised when it has ended."""
         try:
-            return self._outcome(self._process.wait())
-        except KeyboardInterrupt:
+            self._process.wait()
+        except BaseException:
             interrupt([self])
             raise
+        outcome = self.poll()
+        assert outcome is not None
+        return outcome
 
     def signal(self, number: int) -> None:
         """Send a signal; nothing happens when the job has ended."""
         self._process.send_signal(number)
 
-    def _outcome(self, code: int) -> Outcome:
+    def kill(self) -> None:
+        """End the job at once; nothing happens when it has ended."""
+        self._process.kill()
+        self._process.wait()
+        self.poll()
+
+    def _close(self) -> None:
+        self._stdout.close()
+        self._failure.close()
+
+    def _read(self, code: int) -> Outcome:
         if code == 0:
             try:
-                lines = self._stdout.read_text(encoding="utf-8").splitlines()
-                result = json.loads(lines[-1])
-            except (OSError, ValueError, IndexError):
+                result = json.loads(_text(self._stdout).splitlines()[-1])
+            except (ValueError, IndexError):
                 result = None
             if isinstance(result, dict):
                 return Outcome(0, result, "")
             return Outcome(1, None, "it ended without a result")
-        if self._failure.is_file():
-            return Outcome(code, None, self._failure.read_text(encoding="utf-8"))
+        sentence = _text(self._failure)
+        if sentence:
+            return Outcome(code, None, sentence)
         if code < 0:
             name = signal.Signals(-code).name if -code in signal.valid_signals() else str(-code)
             return Outcome(code, None, f"its process was ended by {name}" + " (out of memory?)" * (code == -9))
         return Outcome(code, None, f"its process ended with exit code {code}")
+
+
+def _text(file: IO[bytes]) -> str:
+    file.seek(0)
+    return file.read().decode("utf-8", errors="replace")
 
 
 def interrupt(jobs: Sequence[JobProcess], grace_s: float = _GRACE_S) -> None:
@@ -121,8 +144,7 @@ def interrupt(jobs: Sequence[JobProcess], grace_s: float = _GRACE_S) -> None:
         pass
     finally:
         for job in jobs:
-            if job.poll() is None:
-                job.signal(signal.SIGKILL)
+            job.kill()
 
 
 def join_starter() -> None:
@@ -140,6 +162,6 @@ def join_starter() -> None:
 
 def report_failure(sentence: str) -> None:
     """In a job: leave the sentence it fails with; elsewhere nothing."""
-    place = os.environ.get(FAILURE)
-    if place is not None:
-        Path(place).write_text(sentence, encoding="utf-8")
+    descriptor = os.environ.get(FAILURE)
+    if descriptor is not None:
+        os.write(int(descriptor), sentence.encode())

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 from configuration import CONF, ConfigurationError, parse
+from json_files import read_json
 from optuna.exceptions import OptunaError
 from optuna.importance import get_param_importances
 from optuna.trial import FrozenTrial, TrialState
@@ -43,10 +44,8 @@ def trial_row(trial: FrozenTrial, space: Sequence[Setting]) -> dict[str, Any]:
 
 def run_of(trial: FrozenTrial) -> str | None:
     """Id of the trial's MLflow run, None while it has none."""
-    from json_files import read_json
-
-    directory = trial.user_attrs.get("directory")
-    run_id = (read_json(Path(directory) / RUN) or {}).get("run_id") if directory else None
+    place = Path(trial.user_attrs.get("directory", "")) / RUN
+    run_id = (read_json(place) or {}).get("run_id") if place.is_file() else None
     return run_id if isinstance(run_id, str) else None
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from configuration import ConfigurationError, leaves, nearest, type_problem
+from configuration import ConfigurationError, check_types, leaves, nearest, type_problem
 from omegaconf import DictConfig, OmegaConf
 from schema import violation
 from training_job import NOT_IDENTITY, find_training
@@ -108,11 +108,10 @@ def _setting(entry: Any, known: Mapping[str, Any]) -> Setting:
             raise ConfigurationError(f"{where}: {kind} takes {', '.join(_FIELDS[kind])}; there is no {field!r}{hint}")
     values = _choices(entry, where) if kind == "categorical" else _bounds(entry, where, kind)
     for value in values:
-        default = known[name]
-        fits = "" if default is None or isinstance(default, (list, Mapping)) else type_problem(default, value)
-        if fits:
-            got = "null" if value is None else repr(value)
-            raise ConfigurationError(f"{where}: every value must be {fits} such as {default}; got {got}")
+        try:
+            check_types(name, known[name], value)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"sweep.space: {error}") from None
         problem = violation(name, value)
         if problem:
             raise ConfigurationError(f"sweep.space: {problem}")

@@ -168,6 +168,7 @@ def test_no_job_outlives_a_killed_grid(verb: Path) -> None:
     assert ends(int((verb.parent / "pid-wait").read_text()))
 
 
+@pytest.mark.slow
 def test_runs_stand_below_one_parent_that_is_found_again(verb: Path, tmp_path: Path) -> None:
     store = str(tmp_path / "mlflow.db")
     conf = tmp_path / "conf" / "fake.yaml"

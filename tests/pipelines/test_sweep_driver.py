@@ -1,0 +1,197 @@
+"""The driver with real processes and a real SQLite study: side by side, crashes, kill -9, Ctrl-C, failures."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from optuna.trial import TrialState
+from sweep_driver import SweepDriver
+from sweep_space import Setting
+from sweep_study import Ledger, open_study
+
+PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
+SPACE = [Setting("x", "float", 0.0, 1.0)]
+# Stands for a training: notes its start and end, and does what the test says of its number.
+JOB = f"""
+import json, os, signal, sys, time
+sys.path.insert(0, {str(PIPELINES)!r})
+from pathlib import Path
+from job_process import join_starter, report_failure
+join_starter()
+number = json.loads(os.environ["ATTENTIONVOTE_TRIAL"])["number"]
+folder, x = Path(sys.argv[1]), float(sys.argv[2])
+def note(what):
+    with (folder / "notes").open("a") as file: file.write(f"{{what}} {{number}} {{os.getpid()}} {{x}}\\n")
+note("start")
+times = (folder / "notes").read_text().count(f"start {{number}} ")
+does = json.loads((folder / "does.json").read_text()).get(str(number), "")
+try:
+    if does == "wait": time.sleep(60)
+    time.sleep(0.2)
+except KeyboardInterrupt:
+    note("interrupted"); sys.exit(130)
+if does == "crash" or (does == "crash once" and times == 1): os.kill(os.getpid(), signal.SIGKILL)
+if does == "fail": report_failure("the cloud must be finite, got 3 NaN"); sys.exit(1)
+if does == "prune": sys.exit(3)
+note("end")
+print(json.dumps({{"val_ap": None if does == "no score" else x, "metrics": {{"ap_10": 0.5}}}}))
+"""
+# A sweep in a process of its own, to be killed.
+SWEEP = f"""
+import sys
+sys.path[:0] = [{str(PIPELINES)!r}, {str(Path(__file__).parent)!r}]
+from test_sweep_driver import driver
+from pathlib import Path
+try: driver(Path(sys.argv[1]), int(sys.argv[3]))[1].run(int(sys.argv[2]), lambda: None)
+except KeyboardInterrupt: sys.exit(130)
+"""
+
+
+def driver(folder: Path, workers: int = 1) -> tuple[Ledger, SweepDriver]:
+    """A study in a folder and what drives it."""
+    study = open_study(f"sqlite:///{folder}/study.db", "s", 60)
+    ledger = Ledger(study, SPACE, seed=0, random_trials=2, folder=folder)
+    (folder / "job.py").write_text(JOB, encoding="utf-8")
+    return ledger, SweepDriver(
+        ledger,
+        words=lambda values: [str(folder), str(values["x"])],
+        directory=lambda values: folder / f"training-{values['x']:.6f}",
+        environment=lambda number: {"ATTENTIONVOTE_TRIAL": json.dumps({"number": number})},
+        workers=workers,
+        retries=1,
+        heartbeat_s=0.2,
+        logs=folder / "logs",
+        ended=lambda trial: (folder / f"ended-{trial.number}").touch(exist_ok=False),
+        script=folder / "job.py",
+    )
+
+
+@pytest.fixture
+def does(tmp_path: Path) -> Callable[[dict[int, str]], None]:
+    """Says what the trials of these numbers do."""
+
+    def say(what: dict[int, str]) -> None:
+        (tmp_path / "does.json").write_text(json.dumps(what))
+
+    say({})
+    return say
+
+
+Does = Callable[[dict[int, str]], None]
+
+
+def notes(folder: Path) -> list[list[str]]:
+    path = folder / "notes"
+    return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def states(ledger: Ledger) -> list[str]:
+    return [trial.state.name for trial in ledger.trials]
+
+
+def until(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 60
+    while not ready():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_every_end_of_a_trial_is_written_down_and_stops_no_other(tmp_path: Path, does: Does) -> None:
+    does({0: "fail", 1: "prune", 2: "crash once", 3: "crash", 4: "no score"})
+    ledger, sweep = driver(tmp_path)
+    ledger.begin()[0].report(0.25, 4)  # of a process that was killed
+    sweep.run(6, lambda: None)
+    assert states(ledger) == ["FAIL", "PRUNED", "COMPLETE", "FAIL", "FAIL", "COMPLETE"]
+    starts = [note[1] for note in notes(tmp_path) if note[0] == "start"]
+    assert starts == ["0", "1", "2", "2", "3", "3", "4", "5"]
+    for number in (2, 3):  # taken up with the same parameters
+        assert len({note[3] for note in notes(tmp_path) if note[1] == str(number)}) == 1
+    trials = ledger.trials
+    assert trials[0].user_attrs["reason"] == "the cloud must be finite, got 3 NaN"
+    assert trials[3].user_attrs["reason"] == "its process was ended by SIGKILL (out of memory?)"
+    assert trials[4].user_attrs["reason"].startswith("its training has no val/ap")
+    assert trials[2].value == trials[2].params["x"]
+    assert trials[5].user_attrs["test"] == {"ap_10": 0.5}
+    assert sorted(p.name for p in tmp_path.glob("ended-*")) == [f"ended-{n}" for n in range(6)]
+    assert (tmp_path / "logs" / "trial_002.log").is_file()
+    # The total is reached: the same call does nothing, a larger total only what is missing.
+    again = driver(tmp_path)[1]
+    again.run(6, lambda: None)
+    again.run(7, lambda: None)
+    assert [note[1] for note in notes(tmp_path) if note[0] == "start"] == [*starts, "6"]
+
+
+def test_two_at_a_time_and_never_two_at_one_training(tmp_path: Path, does: Does) -> None:
+    does({})
+    ledger, sweep = driver(tmp_path, workers=2)
+    together = []
+    sweep.run(4, lambda: together.append(len(sweep.running)))
+    assert max(together) == 2
+    assert states(ledger) == ["COMPLETE"] * 4
+    # Somebody is at the training of the next trial: it waits.
+    trial, values = Ledger(ledger.study, SPACE, 0, 2, tmp_path).begin()
+    place = tmp_path / f"training-{values['x']:.6f}"
+    place.mkdir(exist_ok=True)
+    with (place / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        seen = []
+
+        def free() -> None:
+            seen.append(len(sweep.waiting))
+            if len(seen) == 5:
+                fcntl.flock(lock, fcntl.LOCK_UN)
+
+        sweep.run(5, free)
+    assert seen[:4] == [1] * 4
+    assert states(ledger) == ["COMPLETE"] * 5
+    assert ledger.trials[trial.number].params == values
+
+
+def test_killed_in_the_middle_it_goes_on_as_if_it_had_not_been(tmp_path: Path, does: Does) -> None:
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    (whole / "does.json").write_text("{}")
+    ledger, sweep = driver(whole)
+    sweep.run(4, lambda: None)
+    does({1: "wait", 2: "wait"})
+    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "4", "2"], text=True, stderr=-1)
+    until(lambda: {"1", "2"} <= {note[1] for note in notes(tmp_path)}, process)
+    process.kill()
+    process.communicate()
+    does({})
+    torn, again = driver(tmp_path, workers=2)
+    assert states(torn) == ["COMPLETE", "RUNNING", "RUNNING"]
+    assert len(torn.lost()) == 2
+    again.run(4, lambda: None)
+    assert states(torn) == ["COMPLETE"] * 4
+    assert torn.trials[0].params == ledger.trials[0].params
+    started = [(note[1], note[3]) for note in notes(tmp_path) if note[0] == "start"]
+    assert sorted(number for number, _ in started) == ["0", "1", "1", "2", "2", "3"]
+    assert len(set(started)) == 4  # a number has one set of parameters
+    for note in notes(tmp_path):  # no orphan of the killed sweep went on
+        assert not Path(f"/proc/{note[2]}").exists()
+
+
+def test_ctrl_c_ends_the_trials_orderly_and_they_go_on(tmp_path: Path, does: Does) -> None:
+    does({0: "wait", 1: "wait"})
+    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "3", "2"], text=True, stderr=-1)
+    until(lambda: len(notes(tmp_path)) == 2, process)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert [note[0] for note in notes(tmp_path)].count("interrupted") == 2
+    does({})
+    ledger, sweep = driver(tmp_path)
+    sweep.run(3, lambda: None)
+    assert states(ledger) == ["COMPLETE"] * 3
+    assert ledger.count(TrialState.COMPLETE) == 3
+    assert len(list((tmp_path / "logs").iterdir())) == 3
