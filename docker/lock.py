@@ -23,7 +23,7 @@ def wanted() -> dict[str, tuple[str, list[str]]]:
     """Subject and direct requirements of each file, by its name beside this script."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     extras = project["project"]["optional-dependencies"]
-    tracking = [line for line in extras["train"] if line.startswith("mlflow")]
+    tracking = [*(line for line in extras["train"] if line.startswith("mlflow")), *extras["team"]]
     return {
         "requirements.txt": ("What the cell's server needs, closed", project["project"]["dependencies"]),
         "requirements-build.txt": ("What builds the project's wheel", project["build-system"]["requires"]),

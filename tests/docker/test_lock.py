@@ -15,7 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 LINE = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)==(?P<version>[A-Za-z0-9.!+]+) --hash=sha256:[0-9a-f]{64}")
 SERVING = PROJECT["project"]["dependencies"]
-TRACKING = [r for r in PROJECT["project"]["optional-dependencies"]["train"] if r.startswith("mlflow")]
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+TRACKING = [*(r for r in EXTRAS["train"] if r.startswith("mlflow")), *EXTRAS["team"]]
 RENEW = "run `.venv/bin/python docker/lock.py`"
 
 

@@ -166,9 +166,9 @@ def _check_access(client: MlflowClient, uri: str) -> None:
             sentence = str(error).strip().splitlines()[0]
             raise ConnectionError(f"tracking server {uri} must answer as MLflow does, got: {sentence}") from error
         user = read_mlflow_creds().username
-        known = f", it refuses those of {user!r} (HTTP {status})" if user else f" (HTTP {status})"
+        given = f"it refuses those of {user!r}" if user else "it got none"
         raise ConnectionError(
-            f"tracking server {uri} must be given user and password{known}: {_CREDENTIALS}"
+            f"tracking server {uri} must be given user and password, {given} (HTTP {status}): {_CREDENTIALS}"
         ) from error
 
 
