@@ -25,7 +25,7 @@ Compose = Callable[[Sequence[str]], DictConfig]
 Check = Callable[[DictConfig], object]
 SEVERAL = "grids"  # the experiment of a grid over several parts
 # What does not make it another grid: how the jobs are run, not what they are.
-_NOT_IDENTITY = ("resume", "force", "workers", "tracking", "root", "outputs")
+_NOT_IDENTITY = ("resume", "force", "workers", "executor", "cluster", "tracking", "root", "outputs")
 
 
 def run_grid(verb: str, words: Sequence[str], machine: Sequence[str], compose: Compose, check: Check | None) -> None:
