@@ -50,16 +50,15 @@ class RealRegistry:
         """
         import mlflow
 
-        from attentionvote.tracking.store import connect
+        from attentionvote.tracking.store import connect, experiment_id
 
         client = connect(self.store)
         mlflow.set_tracking_uri(self.store)  # the registry looks logged models up through the global client
         if digest is None:
             digest = load_bundle(folder, None).digest
-        experiment = client.get_experiment_by_name("cells")
-        experiment_id = experiment.experiment_id if experiment else client.create_experiment("cells")
-        run = client.create_run(experiment_id)
-        model = client.create_logged_model(experiment_id, name="bundle", source_run_id=run.info.run_id)
+        experiment = experiment_id(client, self.store, "cells")
+        run = client.create_run(experiment)
+        model = client.create_logged_model(experiment, name="bundle", source_run_id=run.info.run_id)
         client.log_model_artifacts(model.model_id, str(folder))
         client.finalize_logged_model(model.model_id, "READY")
         if not client.search_registered_models(f"name = '{name}'"):
