@@ -80,7 +80,8 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[str]], dic
     logging.getLogger("lightning.pytorch").setLevel(level)
 
 
-def test_torchrun_s_environment_is_understood() -> None:
+def test_torchrun_s_environment_is_understood(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # else it is set for the rest of the session
     assert Place.of({}) == Place.of({"WORLD_SIZE": "1", "RANK": "0"}) == Place()
     place = Place.of(TORCHRUN_SAYS)
     assert (place.rank, place.processes, place.local_rank, place.local_processes) == (1, 4, 1, 2)
