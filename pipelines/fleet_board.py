@@ -58,7 +58,7 @@ def stale_splits(trained_with: Mapping[str, str], job: TrainingJob, root: Path) 
     for split, spec in job.specs.items():
         directory = scene_set_directory(root / "scenes", job.part.name, spec)
         now = SceneSet.open(directory).digest if SceneSet.is_complete(directory) else None
-        if trained_with.get(split) != now:
+        if now is None or trained_with.get(split) != now:
             stale.append(split)
     return stale
 

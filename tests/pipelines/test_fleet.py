@@ -1,0 +1,200 @@
+"""The verb fleet: which parts, which words, the leaderboard, members that fail; the real verbs once."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fleet
+import fleet_board
+import pytest
+from configuration import ConfigurationError, compose
+from scipy.spatial import ConvexHull
+from training_job import find_training
+
+from attentionvote.execution import LocalPool
+from attentionvote.registry.versions import Versions
+from attentionvote.simulation import generate_scene_set, scene_set, scene_set_directory
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = [
+    "experiment=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2]", "data.density=1500",
+    "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=2", "trainer.validate_every=2",
+    "trainer.threads=1", "trainer.precision=32-true", "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1",
+    "trainer.schedule.ramp_steps=1", "tracking.system_interval=0", "force=false", "model.centers=[64,32,16,8]",
+    "model.neighbors=[8,8,8,8]", "model.widths=[[8,16],[16,16],[16,16],[16,16]]", "model.propagation=[16,16]",
+    "model.voting=[16]", "model.fusion=[16,16]", "model.head=[16]", "model.refinement.points=16",
+    "model.refinement.widths=[8,16]", "model.refinement.head=[16]",
+]  # fmt: skip
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Any:
+    """The training of the brick on tiny scene sets."""
+    return find_training(compose("train", ["object=brick", *TINY, f"outputs={tmp_path / 'train'}"]))
+
+
+def test_all_is_every_part_whose_mesh_is_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
+    jobs, left_out = fleet.members("all", TINY)
+    assert {"brick", "gear", "connecting_rod"} <= set(jobs)
+    assert sorted(left_out) == ["bunny", "tless_20", "tless_22", "tless_29"]
+    assert "SileaneBunny.obj" in left_out["bunny"]
+    assert list(fleet.members("gear, brick,gear", TINY)[0]) == ["gear", "brick"]
+    with pytest.raises(ConfigurationError, match=r"^object bunny: .*SileaneBunny.obj"):
+        fleet.members("brick,bunny", TINY)
+
+
+@pytest.mark.parametrize(
+    ("objects", "words", "message"),
+    [
+        ("brik", TINY, "objects must be all or among brick, .*; got 'brik', did you mean 'brick'"),
+        ("", TINY, "objects= must leave one part that can be trained, got none"),
+        ("brick", [*TINY, "trainer.batch_size=9"], "object brick: trainer.batch_size must be at most the 8 training"),
+    ],
+)
+def test_parts_that_cannot_be_trained_are_refused_before_any_work(objects: str, words: list[str], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        fleet.members(objects, words)
+
+
+def test_words_of_the_training_are_handed_on_and_those_of_the_fleet_are_not() -> None:
+    words = [
+        "objects='gear,brick'",
+        "workers=2",
+        "executor=ray",
+        "cluster.gpus=1.0",
+        "threads=4",
+        "seed=3",
+        "data.pool=9",
+    ]
+    assert fleet.training_words(words) == ["seed=3", "data.pool=9"]
+    with pytest.raises(ConfigurationError, match="a fleet takes objects=NAME,NAME or objects=all, got object="):
+        fleet.training_words(["object=gear"])
+
+
+def test_exports_and_evaluations_lie_beside_the_trainings() -> None:
+    said = ["outputs=o/train", "root=d", "tracking.store=s.db", "export=['signing_keys=k','scenes=40']"]
+    words, places = fleet.words_of_verbs(compose("fleet", said), ["seed=3"], "brick")
+    assert words["train"] == ("seed=3",)
+    assert words["export"] == ("trained=o/train", "root=d", "outputs=o/export", "signing_keys=k", "scenes=40")
+    expected = ("root=d", "bundles=o/export", "outputs=o/evaluate", "tracking.store=s.db", "trusted_key=k/signing.pub")
+    assert words["evaluate"] == expected
+    assert places == {"bundles": Path("o/export")}
+    with pytest.raises(ConfigurationError, match="there is no setting 'scnes', did you mean 'scenes'"):
+        fleet.words_of_verbs(compose("fleet", ["export=['scnes=40']"]), [], "brick")
+
+
+def test_data_is_stale_when_the_configuration_would_generate_other_scenes(
+    job: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hull = lambda part, *_: (part.vertices[ConvexHull(part.vertices).vertices],)  # noqa: E731
+    monkeypatch.setattr(scene_set, "convex_hulls", hull)
+    now = {}
+    for split in ("train", "val"):
+        spec = job.specs[split]
+        place = scene_set_directory(tmp_path / "scenes", "brick", spec)
+        now[split] = generate_scene_set(job.part, spec, place, progress=False).digest
+    assert fleet_board.stale_splits({**now, "test": "0" * 64}, job, tmp_path) == ["test"]  # never generated
+    assert fleet_board.stale_splits({**now, "train": "0" * 64}, job, tmp_path) == ["train", "test"]
+
+
+def test_a_row_tells_of_the_champion_and_of_stale_data(export_brick: Any, job: Any, tmp_path: Path) -> None:
+    store = f"sqlite:///{tmp_path}/mlflow.db"
+    versions = Versions(store, "brick")
+    first = export_brick("first")
+    versions.set_champion(versions.register(first, {}))
+    second = export_brick("second")
+    answers = {
+        "evaluate": {
+            "figures": {"ap_10": 0.9, "ap_5": 0.8, "ap_2": 0.4, "latency_p50_ms": 55.4},
+            "intervals": {"ap_10": [0.85, 0.94], "ap_5": [0.7, 0.9], "ap_2": [0.3, 0.5]},
+        },
+        "seconds": 3.0,
+    }
+    known = fleet_board.row("brick", job, answers, tmp_path / "outputs" / "export", tmp_path / "data", store)
+    assert known["bundle"] == second.digest
+    assert (known["champion"]["version"], known["champion"]["bundle"]) == (1, first.digest)
+    assert 0 <= known["champion"]["age_days"] < 0.01
+    assert known["stale"] == ["train", "val", "test"]
+    assert fleet_board.cells(known) == [
+        "brick", "0.900", "0.800", "0.400", "0.850 to 0.940", "55 ms", "version 1, 0 d, another bundle",
+        "train, val, test", "done",
+    ]  # fmt: skip
+    failed = fleet_board.row("gear", job, {"failed": "train", "sentence": "no disk"}, tmp_path, tmp_path, store)
+    assert failed["champion"] is None
+    assert fleet_board.cells(failed) == ["gear", "", "", "", "", "", "none", "", "train: no disk"]
+    better = {**known, "object": "rod", "ap_2": 0.5}
+    rows = fleet_board.best_first([failed, known, better])
+    assert [r["object"] for r in rows] == ["rod", "brick", "gear"]
+    board = fleet_board.write(tmp_path, rows, {"bunny": "no mesh"})
+    text = board.read_text()
+    assert "| brick | 0.900 | 0.800 | 0.400 | 0.850 to 0.940 | 55 ms | version 1, 0 d, another bundle |" in text
+    assert "- bunny: no mesh" in text
+    stored = json.loads((tmp_path / "leaderboard.json").read_text())
+    assert stored == {"members": rows, "left_out": {"bunny": "no mesh"}}
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """Ends the worker of one part, answers for the others."""
+
+    deadly: str
+
+    def __call__(self, name: str) -> dict[str, Any]:
+        if name == self.deadly:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return {"seconds": 0.1}
+
+
+@pytest.fixture
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers import a task's module by name: this one goes by its file's."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.setitem(sys.modules, Path(__file__).stem, sys.modules[__name__])
+    monkeypatch.setattr(Deadly, "__module__", Path(__file__).stem)
+
+
+@pytest.mark.usefixtures("importable")
+def test_a_part_that_ends_its_workers_is_one_that_failed() -> None:
+    answers = fleet._run(Deadly("gear"), ["brick", "gear", "rod"], LocalPool(), 2, 1, 1)  # type: ignore[arg-type]
+    assert answers["brick"] == answers["rod"] == {"seconds": 0.1}
+    assert answers["gear"] == {"failed": "worker", "sentence": "it died 2 times (signal 9)"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_real_verbs_one_part_to_its_evaluation_and_one_that_fails(tmp_path: Path) -> None:
+    (tmp_path / "data" / "scenes").mkdir(parents=True)
+    (tmp_path / "data" / "scenes" / "gear").touch()  # in the way of the gear's scenes
+    words = [
+        "objects='gear,brick'", *TINY, f"root={tmp_path}/data", f"outputs={tmp_path}/train", f"fleets={tmp_path}/fleet",
+        f"tracking.store={tmp_path}/mlflow.db",
+        f"export=['scenes=2','limits.scenes=1','golden=1','signing_keys={tmp_path}/keys']",
+        "evaluate=['evaluation.cycles=1','simulation=smoke','simulation.drop_counts=[1,2]']",
+    ]  # fmt: skip
+    script = ROOT / "pipelines" / "fleet.py"
+    done = subprocess.run(
+        [sys.executable, script, *words], capture_output=True, text=True, timeout=580, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 1, done.stderr
+    result = json.loads(done.stdout)
+    brick, gear = result["members"]
+    assert (brick["object"], brick["failed"], brick["stale"], brick["champion"]) == ("brick", None, [], None)
+    assert brick["ap_10"] is not None
+    assert brick["latency_p50_ms"] > 0
+    assert len(brick["intervals"]["ap_2"]) == 2
+    assert result["failures"] == {"gear": gear["failed"]}
+    assert gear["failed"].startswith("train: ")
+    assert "scenes/gear" in gear["failed"]
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("fleet: 1 of 2 parts are not done: gear failed, train: ")
+    assert "Traceback" not in done.stderr
+    assert json.loads((tmp_path / "fleet" / "leaderboard.json").read_text())["members"] == result["members"]
+    assert (tmp_path / "export" / "brick" / "latest" / "manifest.json").is_file()
