@@ -8,8 +8,6 @@ have in all. The best settings are an experiment afterwards: make train OBJECT=c
 
 from __future__ import annotations
 
-import logging
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,24 +16,21 @@ from configuration import CONF, parse, primary_groups
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_hardware
 
-log = logging.getLogger("attentionvote.sweep")
-
 
 def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     """Bring the study to its total; its best trial.
 
     Args:
         cfg: the sweep's configuration.
-        words: it was composed of; those of the training are handed on to the trials.
+        words: it was composed of, the machine's default included; those of the training are handed on to the trials.
     """
     from folder_lock import locked_folder
     from sweep_job import SweepJob
     from sweep_report import check_save_as
 
-    base = [*preset_of_hardware(list(words)), *training_words(words)]
     check_save_as(cfg.save_as)
     with configuring():
-        job = SweepJob(cfg, base, _space_name(words))
+        job = SweepJob(cfg, training_words(words), _space_name(words))
     with locked_folder(job.folder, cfg.sweeps, "sweep"):
         with configuring():
             job.open()
@@ -65,5 +60,17 @@ def _plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True)
 
 
+def main() -> None:
+    """The verb; its trials need the words as they were said."""
+    said: list[str] = []
+
+    def defaults(words: list[str]) -> list[str]:
+        machine = preset_of_hardware(words)
+        said[:] = [*machine, *words]
+        return machine
+
+    command("sweep", lambda cfg: run(cfg, said), defaults=defaults, check=check)
+
+
 if __name__ == "__main__":
-    command("sweep", lambda cfg: run(cfg, sys.argv[1:]), defaults=preset_of_hardware, check=check)
+    main()

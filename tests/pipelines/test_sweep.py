@@ -24,9 +24,9 @@ from attentionvote import tracking
 from attentionvote.tracking.store import connect, resolve_store
 
 ROOT = Path(__file__).resolve().parents[2]
-EPOCHS = 6
+EPOCHS = 5
 TINY = [
-    "object=brick", "experiment=smoke", "sweep=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2]",
+    "object=brick", "experiment=smoke", "sweep=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1]",
     "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", f"trainer.max_epochs={EPOCHS}",
     "trainer.validate_every=1", "trainer.threads=1", "trainer.average_decay=0.5", "trainer.precision=32-true",
     "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1", "trainer.schedule.ramp_steps=1",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from optuna.trial import Trial, TrialState
@@ -126,3 +127,25 @@ def test_the_name_says_part_space_and_settings() -> None:
     assert study_name("gear", "compact", {"a": 1}) == study_name("gear", "compact", {"a": 1})
     assert study_name("gear", "compact", {"a": 1}) != study_name("gear", "compact", {"a": 2})
     assert study_name("gear", "compact", {"a": 1}).startswith("gear-compact-")
+
+
+def test_a_study_in_postgresql_stands_a_lost_trial_and_two_places(postgresql: Any, tmp_path: Path) -> None:
+    name = postgresql.create()
+
+    def opened(place: str) -> Ledger:
+        study = open_study(postgresql.uri(name), "s", 60, make_pruner("median", 1, 1, 3, 1, 9))
+        return Ledger(study, SPACE, seed=1, random_trials=2, folder=tmp_path / place)
+
+    first = opened("here")
+    trial, values = first.begin()
+    trial.report(0.25, 4)
+    with pytest.raises(ValueError, match=r"/here gave a sign of life less than 180 s ago"):
+        opened("elsewhere").lost()
+    again = opened("here")
+    trial, same = again.begin(*again.lost())
+    again.end(trial, TrialState.COMPLETE, 0.5)
+    assert (same, again.trials[0].intermediate_values) == (values, {4: 0.25})
+    assert again.best is not None
+    for used in (first, again):
+        used.study._storage.remove_session()
+    postgresql.drop(name)
