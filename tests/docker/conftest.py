@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 
 from attentionvote.contract import CARD_KEY, ModelCard, PartCard
@@ -172,6 +173,30 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
             continue
         path.chmod(0o755 if path.is_dir() else 0o644)
     return Cell(folder / "bundles", secrets, token, _cloud(1), asked[0].camera_from_part)
+
+
+@pytest.fixture(scope="session")
+def compose() -> dict[str, Any]:
+    """The file docker/compose.yaml, parsed."""
+    content = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture(scope="session")
+def interpolate() -> Callable[..., str]:
+    """A text of compose.yaml with its variables replaced as compose does: ``${A:-default}``, ``${A:+when set}``."""
+
+    def replaced(text: str, **values: str) -> str:
+        def value(match: re.Match[str]) -> str:
+            given = values.get(match[1], "")
+            return (given or match[3]) if match[2] == "-" else match[3] * bool(given)
+
+        done = re.sub(r"\$\{([A-Z_]+):([-+])([^}]*)\}", value, text)
+        assert "$" not in done, done
+        return done
+
+    return replaced
 
 
 @pytest.fixture(scope="session")

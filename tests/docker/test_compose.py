@@ -2,40 +2,41 @@
 
 from __future__ import annotations
 
+import argparse
 import http.client
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
+
+from attentionvote.inference.server import serve
 
 ROOT = Path(__file__).resolve().parents[2]
 USER = "65532:65532"
 
 
-@pytest.fixture(scope="module")
-def compose() -> dict[str, Any]:
-    """The file, parsed."""
-    content = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))
-    assert isinstance(content, dict)
-    return content
-
-
-@pytest.mark.parametrize("name", ["inference", "mlflow"])
+@pytest.mark.parametrize("name", ["inference", "mlflow", "mlflow-team", "postgres"])
 def test_a_container_may_do_no_more_than_it_must(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
     assert service["read_only"] is True
-    assert [entry.split(":")[0] for entry in service["tmpfs"]] == ["/tmp"]
+    sockets = ["/var/run/postgresql"] if name == "postgres" else []
+    assert [entry.split(":")[0] for entry in service["tmpfs"]] == ["/tmp", *sockets]
     assert service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
     assert service["pids_limit"] <= 256
-    assert service["mem_limit"] in ("2g", "3g")
-    assert not {"privileged", "cap_add", "network_mode", "pid", "user", "devices"} & set(service)
-    assert all(port.rsplit(":", 2)[0] in ("127.0.0.1", "${CELL_ADDRESS:-127.0.0.1}") for port in service["ports"])
+    assert service["mem_limit"] in ("2g", "3g", "4g")
+    assert not {"privileged", "cap_add", "network_mode", "pid", "devices"} & set(service)
+    # Our images name their user; PostgreSQL's would start as root.
+    assert service.get("user") == ("999:999" if name == "postgres" else None)
+    own_machine = ("127.0.0.1", "${CELL_ADDRESS:-127.0.0.1}", "${TEAM_ADDRESS:-127.0.0.1}")
+    assert all(port.rsplit(":", 2)[0] in own_machine for port in service.get("ports", []))
 
 
 def test_the_images_are_built_here_with_fixed_versions(compose: dict[str, Any], stages: dict[str, Any]) -> None:
@@ -43,8 +44,11 @@ def test_the_images_are_built_here_with_fixed_versions(compose: dict[str, Any], 
     tracking = (ROOT / "constraints.txt").read_text(encoding="utf-8").partition("\nmlflow==")[2].partition("\n")[0]
     services = compose["services"]
     assert services["inference"]["image"] == f"attentionvote:{version}"
-    assert services["mlflow"]["image"] == f"attentionvote-mlflow:{tracking}"
-    for service in services.values():
+    assert services["mlflow"]["image"] == services["mlflow-team"]["image"] == f"attentionvote-mlflow:{tracking}"
+    assert re.fullmatch(r"docker\.io/library/postgres:15\.\d+-bookworm", services["postgres"]["image"])
+    for name, service in services.items():
+        if name == "postgres":
+            continue
         build = service["build"]
         assert (ROOT / "docker" / build["context"]).resolve() == ROOT
         assert (ROOT / build["dockerfile"]).is_file()
@@ -55,14 +59,35 @@ def test_only_the_state_can_be_written(compose: dict[str, Any], stages: dict[str
     service, image = compose["services"]["inference"], stages["inference"]
     volumes = {entry.rsplit(":", 1)[-1] if not entry.endswith(":ro") else entry for entry in service["volumes"]}
     assert volumes == {"/state", "${CELL_BUNDLES:-./cell/bundles}:/bundles:ro"}
-    assert set(service["secrets"]) == set(compose["secrets"]) == {"token", "signing.pub"}
+    assert set(service["secrets"]) == {"token", "signing.pub", "registry"}
     words = image["CMD"]
     given = dict(zip(words[2::2], words[3::2], strict=True))
     assert words[:2] == ["serve", "/bundles/latest"]
     assert given["--state"] == image["VOLUME"] == "/state"
     assert (given["--token-file"], given["--key"]) == ("/run/secrets/token", "/run/secrets/signing.pub")
-    assert compose["volumes"].keys() == {"state", "mlflow"}
     assert compose["services"]["mlflow"]["volumes"] == ["mlflow:/data"]
+
+
+def test_the_cell_serves_its_folder_until_it_is_told_to_follow_a_registry(
+    compose: dict[str, Any], stages: dict[str, Any], interpolate: Callable[..., str]
+) -> None:
+    command, file = compose["services"]["inference"]["command"], compose["secrets"]["registry"]["file"]
+    plain = shlex.split(interpolate(command))
+    assert plain[: len(stages["inference"]["CMD"])] == stages["inference"]["CMD"]
+    assert plain[len(stages["inference"]["CMD"]) :] == ["--registry", "http://mlflow:5000"]
+    assert interpolate(file) == "/dev/null"
+    told = {
+        "CELL_MODEL": "models:/attentionvote-gear@champion",
+        "CELL_REGISTRY": "https://team",
+        "CELL_REGISTRY_AUTH": "f",
+    }
+    words = shlex.split(interpolate(command, **told))
+    assert words[:2] == ["serve", told["CELL_MODEL"]]
+    assert words[-4:] == ["--registry", "https://team", "--registry-auth-file", "/run/secrets/registry"]
+    assert interpolate(file, **told) == "f"
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    assert parser.parse_args(words[1:]).registry_auth_file == Path("/run/secrets/registry")
 
 
 def ask(port: int, host: str) -> int:
@@ -89,7 +114,8 @@ def test_mlflow_answers_under_its_name_in_the_network_and_to_no_stranger(
         words = [word.replace(before, after) for word in words]
     environment = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW")}
     environment |= {k: v for k, v in stages["mlflow"]["ENV"].items() if k.startswith("MLFLOW")} | service["environment"]
-    words[0] = str(Path(sys.executable).parent / words[0])
+    words = [word.replace("/opt/mlflow/bin", str(ROOT / "docker")) for word in words]
+    environment["PATH"] = f"{Path(sys.executable).parent}:{environment['PATH']}"
     silent = subprocess.DEVNULL
     process = subprocess.Popen(words, env=environment, cwd=tmp_path, stdout=silent, stderr=silent)
     try:
