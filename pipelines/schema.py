@@ -154,6 +154,7 @@ RANGES: tuple[Range, ...] = (
     Range("trainer.log_every_steps", low=1),
     Range("tracking.store", kind=str),
     Range("executor", options=("local", "ray", "slurm")),
+    Range("threads", low=1, high=1024, kind=int),
     Range("cluster.address", kind=str),
     Range("cluster.slurm.system", options=("slurm", "local")),
     Range("cluster.slurm.minutes", low=1),
