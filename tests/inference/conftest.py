@@ -5,9 +5,10 @@ from __future__ import annotations
 import datetime
 import http.server
 import ipaddress
+import os
+import signal
 import socket
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -82,9 +83,6 @@ class RealRegistry:
 
     def kill(self) -> None:
         """kill -9 of the server and its children."""
-        import os
-        import signal
-
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(10)
 
@@ -209,20 +207,6 @@ def gate(real_registry: RealRegistry) -> Iterator[Gate]:
             made.go_on.set()
             server.shutdown()
             thread.join()
-
-
-@pytest.fixture(scope="session")
-def eventually() -> Callable[[Callable[[], Any], str], Any]:
-    """Waits until a condition is true, at most 30 s."""
-
-    def wait(condition: Callable[[], Any], what: str) -> Any:
-        until = time.monotonic() + 30
-        while not (value := condition()):
-            assert time.monotonic() < until, f"waited in vain until {what}"
-            time.sleep(0.02)
-        return value
-
-    return wait
 
 
 def make_certificate(folder: Path) -> tuple[Path, Path]:

@@ -52,7 +52,7 @@ class Following:
         serving: Serving,
         metrics: Metrics,
         poll_s: float = 10.0,
-        patience_s: float = 10.0,
+        patience_s: float = 30.0,
     ) -> None:
         self._registry, self._bundles, self._watch = registry, bundles, watch
         self._serving, self._metrics = serving, metrics
