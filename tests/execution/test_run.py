@@ -99,6 +99,14 @@ def test_leaving_early_ends_the_workers(executor: Executor, marks: Path) -> None
     assert not multiprocessing.active_children()
 
 
+def test_a_job_that_no_machine_can_take_does_not_wait_for_ever(ray_cluster: RayCluster) -> None:
+    message = "must have 3 cores and 0 GPUs for a job, but they have 2 cores and 0 GPUs: lower threads or cluster.gpus"
+    with pytest.raises(ValueError, match=message):
+        list(run_all(square, [1], ray_cluster, threads=3))
+    with pytest.raises(ValueError, match="must have 1 cores and 1 GPUs for a job"):
+        list(run_all(square, [1], RayCluster(gpus=1)))
+
+
 def test_no_jobs_need_no_worker(executor: Executor) -> None:
     assert list(run_all(square, [], executor, workers=2)) == []
 

@@ -52,6 +52,7 @@ class RayCluster:
 
         Raises:
             ConnectionError: when there is no cluster at ``address``.
+            ValueError: when no machine of it can take a job.
         """
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         import ray
@@ -60,6 +61,7 @@ class RayCluster:
         if ours:
             self._join(ray, workers * threads)
         try:
+            self._check_room(ray, threads)
             yield from self._run(ray, task, jobs, workers, Attempts(retries, len(jobs)), threads)
         finally:
             if ours:
@@ -76,6 +78,16 @@ class RayCluster:
                 f"the Ray cluster at address={self.address or 'null'} cannot be joined ({first}): start one with "
                 "`ray start --head`, or set cluster.address=null for one of this machine"
             ) from error
+
+    def _check_room(self, ray: Any, threads: int) -> None:
+        """Ray would wait for ever for a machine that is large enough."""
+        machines = [machine["Resources"] for machine in ray.nodes() if machine["Alive"]]
+        if not any(m.get("CPU", 0) >= threads and m.get("GPU", 0) >= self.gpus for m in machines):
+            have = "; ".join(f"{m.get('CPU', 0):g} cores and {m.get('GPU', 0):g} GPUs" for m in machines)
+            raise ValueError(
+                f"a machine of the Ray cluster must have {threads} cores and {self.gpus:g} GPUs for a job, but they "
+                f"have {have}: lower threads or cluster.gpus"
+            )
 
     def _run(
         self,
