@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
@@ -18,7 +19,7 @@ from typing import Any
 import pytest
 import train
 from configuration import ConfigurationError, compose
-from training_processes import Place, refuse_grid
+from training_processes import Place, first_speaks, refuse_grid
 
 ROOT = Path(__file__).resolve().parents[2]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
@@ -124,6 +125,43 @@ def test_a_refusal_is_said_once_a_machine_and_at_once(start: Start, tmp_path: Pa
     assert said(3, 1, "trainer.max_epoch=3") == ""
     assert "a grid (-m) must be run by one process" in said(0, 0, "-m", "seed=1,2")
     assert not list(tmp_path.iterdir())
+
+
+def test_another_process_only_says_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = RuntimeError("[../gloo/transport/tcp/pair.cc:547] Connection closed by peer [127.0.0.1]:31")
+
+    def said(place: Place, error: Exception, raised: type[Exception], message: str) -> str:
+        terminal = io.StringIO()
+
+        def fail() -> None:
+            with first_speaks(place):
+                print("progress", file=sys.stderr)
+                raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stderr", terminal)
+            patch.setattr(sys, "__stderr__", terminal)
+            with pytest.raises(raised, match=message):
+                fail()
+            assert (logging.root.manager.disable >= logging.CRITICAL) == (place.rank > 0)
+            logging.disable(logging.NOTSET)
+            if sys.stderr is not terminal:
+                sys.stderr.close()
+        assert ("progress" in terminal.getvalue()) == (place.rank == 0)
+        return terminal.getvalue().replace("progress\n", "")
+
+    first, second = Place(0, 2, 0, 2), Place(1, 2, 1, 2)
+    damaged = ValueError("cloud 3 is damaged")
+    assert said(second, damaged, ValueError, "cloud 3") == "train: process 2 of 2: cloud 3 is damaged\n"
+    assert said(first, damaged, ValueError, "cloud 3") == ""  # the verb says it, as with one process
+    for place in (first, second):
+        assert said(place, broken, ConnectionError, "another process of this training has ended; run the same") == ""
+    assert said(Place(), broken, RuntimeError, "closed by peer") == ""
+    elsewhere = ConfigurationError("object bunny: no mesh")
+    assert said(second, elsewhere, ConfigurationError, "bunny") == ""
+    assert said(Place(8, 16, 0, 8), elsewhere, ConfigurationError, "bunny") == (
+        "train: process 9 of 16: object bunny: no mesh\n"
+    )
 
 
 def curves(database: Path, run_id: str) -> dict[str, list[tuple[int, float]]]:

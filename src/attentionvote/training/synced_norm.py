@@ -32,12 +32,12 @@ class SyncedRowNorm(RowNorm):
         return out.view(x.shape)
 
     @torch.no_grad()
-    def _remember(self, count: float, mean: Tensor, variance: Tensor) -> None:
+    def _remember(self, count: Tensor, mean: Tensor, variance: Tensor) -> None:
         assert self.momentum is not None
         assert self.running_mean is not None
         assert self.running_var is not None
         assert self.num_batches_tracked is not None
-        unbiased = variance * (count / max(count - 1.0, 1.0))
+        unbiased = variance * (count / (count - 1.0).clamp(min=1.0))
         for running, value in ((self.running_mean, mean), (self.running_var, unbiased)):
             running.copy_((1 - self.momentum) * running + self.momentum * value)
         self.num_batches_tracked.add_(1)
@@ -67,7 +67,7 @@ def _wide(rows: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _statistics(rows: Tensor) -> tuple[float, Tensor, Tensor]:
+def _statistics(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Number, mean and biased variance of the rows of all processes: each tells its own (Chan et al. 1979)."""
     wide = _wide(rows)
     own_mean = wide.mean(0) if len(wide) else wide.new_zeros(wide.shape[1])
@@ -78,25 +78,24 @@ def _statistics(rows: Tensor) -> tuple[float, Tensor, Tensor]:
     count = counts.sum().clamp(min=1.0)
     mean = (counts * means).sum(0) / count
     variance = (sums + counts * (means - mean).square()).sum(0) / count
-    return float(count), mean.to(wide.dtype), variance.to(wide.dtype)
+    return count.to(wide.dtype), mean.to(wide.dtype), variance.to(wide.dtype)  # no wait for a GPU
 
 
 class _Normalize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, scale: Tensor, count: float
+        ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, scale: Tensor, count: Tensor
     ) -> Tensor:
-        ctx.save_for_backward(rows, weight, mean, scale)
-        ctx.count = count
+        ctx.save_for_backward(rows, weight, mean, scale, count)
         return ((_wide(rows) - mean) * (scale * weight) + bias).to(rows.dtype)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        rows, weight, mean, scale = ctx.saved_tensors
+        rows, weight, mean, scale, count = ctx.saved_tensors
         gradient = _wide(gradients[0])
         normed = (_wide(rows) - mean) * scale
         own = torch.stack([gradient.sum(0), (gradient * normed).sum(0)])
         # A row moves the statistics of all rows, those of other processes included.
-        along, across = summed(own) / ctx.count
+        along, across = summed(own) / count
         moved = (gradient - along - normed * across) * (scale * weight)
         return moved.to(rows.dtype), own[1], own[0], None, None, None
