@@ -112,7 +112,7 @@ def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurat
         tags={"grid.overrides": said, "grid.jobs": len(jobs)},
         config_yaml=OmegaConf.to_yaml(OmegaConf.create([list(job) for job in jobs])),
     )
-    log.info("%d jobs below the run %s", len(jobs), run.url_hint)
+    log.info("%d jobs; the run above theirs: %s", len(jobs), run.url_hint)
     return run
 
 

@@ -24,7 +24,7 @@ from attentionvote import tracking
 from attentionvote.tracking.store import connect, resolve_store
 
 ROOT = Path(__file__).resolve().parents[2]
-EPOCHS = 5
+EPOCHS = 4
 TINY = [
     "object=brick", "experiment=smoke", "sweep=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1]",
     "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", f"trainer.max_epochs={EPOCHS}",
@@ -63,7 +63,7 @@ def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp
     process = subprocess.Popen([*command, "trials=1"], cwd=ROOT, text=True, stdout=-1, stderr=-1)
     job = sweep_of(words)
     deadline = time.monotonic() + 300
-    while not (job.ledger.trials and max(job.ledger.trials[0].intermediate_values, default=0) >= 3):
+    while not (job.ledger.trials and max(job.ledger.trials[0].intermediate_values, default=0) >= 2):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -133,15 +133,15 @@ def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp
     assert found.directory.name == job.directory(best["values"]).name
 
 
+@pytest.mark.slow
 def test_a_sweep_of_failures_says_why(words: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    words = [*words, "outputs=/proc/version/x", "trials=2", "workers=2"]
-    with pytest.raises(ValueError, match=r"of 2 trials 2 failed and none is complete; trial 1: outputs=.*x cannot be"):
+    words = [*words, "outputs=/proc/version/x", "trials=1"]
+    with pytest.raises(ValueError, match=r"of 1 trials 1 failed and none is complete; trial 0: outputs=.*x cannot be"):
         run(words)
     assert "trial 0 failed: outputs=/proc/version/x cannot be written" in caplog.text
-    rows = json.loads(next(tmp_path.glob("sweep/brick/*/trials.json")).read_text())
-    assert [row["state"] for row in rows] == ["fail", "fail"]
-    with pytest.raises(ValueError, match="of 2 trials 2 failed"):  # they are not tried again
-        run(words)
+    (row,) = json.loads(next(tmp_path.glob("sweep/brick/*/trials.json")).read_text())
+    assert (row["state"], row["val_ap"], row["run_id"]) == ("fail", None, None)
+    assert row["reason"].startswith("outputs=/proc/version/x cannot be written")
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,7 @@ def until(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_every_end_of_a_trial_is_written_down_and_stops_no_other(tmp_path: Path, does: Does) -> None:
     does({0: "fail", 1: "prune", 2: "crash once", 3: "crash", 4: "no score"})
     ledger, sweep = driver(tmp_path)
@@ -156,6 +157,7 @@ def test_two_at_a_time_and_never_two_at_one_training(tmp_path: Path, does: Does)
     assert ledger.trials[trial.number].params == values
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_as_if_it_had_not_been(tmp_path: Path, does: Does) -> None:
     whole = tmp_path / "whole"
     whole.mkdir()
