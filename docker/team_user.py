@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Make a user of the team's MLflow server, with a password of his own in a file.
 
     docker/team_user.py person NAME             reads and writes every experiment and every model

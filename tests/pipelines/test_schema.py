@@ -76,3 +76,12 @@ def test_a_range_says_what_it_allows() -> None:
     assert str(Range("x", low=1, high=3)) == "at least 1 and at most 3"
     assert str(Range("x")) == "a finite number"
     assert str(Range("x", kind=str)) == "a text"
+
+
+@pytest.mark.parametrize("key", ["tracking.store", "storage"])
+def test_an_address_with_a_password_is_refused_without_saying_it(key: str) -> None:
+    said = violation(key, "postgresql://me:swordfish@db/mlflow")
+    assert said.startswith(f"{key} must not hold a password, because settings are kept with every run")
+    assert "'postgresql://me:***@db/mlflow'" in said
+    assert "swordfish" not in said
+    assert violation(key, "postgresql://me@db:5432/mlflow") == ""

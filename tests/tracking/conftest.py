@@ -29,3 +29,15 @@ def run(store):
     run = tracking.start_run(store, "rod", name="test", system_interval_s=0)
     yield run
     run.close("FINISHED")
+
+
+@pytest.fixture
+def guarded(postgresql, monkeypatch, tmp_path):
+    """URI of an empty PostgreSQL database with the password of its owner, ``swordfish/7``; a working directory too."""
+    monkeypatch.chdir(tmp_path)
+    name = postgresql.create()
+    postgresql.run("create role guarded login password 'swordfish/7'")
+    postgresql.run(f"alter database {name} owner to guarded")
+    yield postgresql.uri(name, "guarded:swordfish%2F7")
+    postgresql.drop(name)
+    postgresql.run("drop role guarded")

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from pathlib import Path
 
 import pytest
 
@@ -56,22 +57,34 @@ def test_serve_refuses_a_server():
 
 
 @pytest.mark.slow
-def test_ui_prints_one_json_line_and_ends_on_interrupt(repository, tmp_path):
-    store = f"sqlite:///{tmp_path}/mlflow.db"
-    command = [sys.executable, str(repository / "pipelines/ui.py"), "--store", store]
-    environment = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
+def test_ui_prints_one_json_line_without_the_password_and_ends_on_interrupt(repository, guarded):
+    command = [sys.executable, str(repository / "pipelines/ui.py")]
+    environment = {**os.environ, "MLFLOW_TRACKING_URI": guarded}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as ui:
         assert ui.stdout is not None
-        answer = json.loads(ui.stdout.readline())
-        assert answer["store"] == store
+        line = ui.stdout.readline()
+        answer = json.loads(line)
+        assert answer["store"] == guarded.replace("swordfish%2F7", "***")
         with urllib.request.urlopen(answer["url"] + "/health", timeout=10) as reply:
             assert reply.read() == b"OK"
+        commands = [_command_line(path) for path in Path("/proc").glob("[0-9]*")]  # what `ps` shows to everybody
+        assert any("mlflow" in words and answer["url"].rpartition(":")[2] in words for words in commands)
+        assert not [words for words in commands if "swordfish" in words]
         ui.send_signal(signal.SIGINT)
-        rest, _ = ui.communicate(timeout=30)
+        rest, said = ui.communicate(timeout=30)
     assert ui.returncode == 0
     assert rest == ""
+    assert "swordfish" not in line + said
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(answer["url"] + "/health", timeout=5)
+
+
+def _command_line(process):
+    """The words that a process was started with; nothing when it has just ended."""
+    try:
+        return (process / "cmdline").read_bytes().decode(errors="replace")
+    except OSError:
+        return ""
 
 
 def test_ui_rejects_an_impossible_store_in_one_sentence(repository):

@@ -20,8 +20,6 @@ from attentionvote.tracking.store import (
     shown,
 )
 
-PASSWORD = "swordfish%2F7"
-
 
 def test_resolve_store_prefers_the_argument_then_the_environment_then_outputs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
@@ -75,24 +73,14 @@ def test_shown_hides_passwords_and_nothing_else(store, said):
     assert has_password(store) == ("***" in said)
 
 
-@pytest.fixture
-def guarded(postgresql, monkeypatch, tmp_path):
-    """URI of an empty PostgreSQL database with the password of the role that owns it, ``guarded``."""
-    monkeypatch.chdir(tmp_path)
-    name = postgresql.create()
-    postgresql.run(f"create role guarded login password '{PASSWORD.replace('%2F', '/')}'")
-    postgresql.run(f"alter database {name} owner to guarded")
-    yield postgresql.uri(name, f"guarded:{PASSWORD}")
-    postgresql.drop(name)
-    postgresql.run("drop role guarded")
-
-
 def test_what_goes_wrong_is_one_sentence_without_the_password(guarded, caplog, capfd):
     client = connect(guarded)
     experiment = experiment_id(client, guarded, "rod")
     assert client.get_experiment(experiment).name == "rod"
     wrong = {
-        guarded.replace(PASSWORD, "sword%2Ffish"): "cannot be opened: .*password authentication failed for .*guarded",
+        guarded.replace(
+            "swordfish", "sword%2Ffish"
+        ): "cannot be opened: .*password authentication failed for .*guarded",
         guarded.replace("/test_", "/no_test_"): "cannot be opened: .*database .* does not exist",
         guarded.replace("?host=", "?host=/nowhere"): "cannot be opened: .*No such file or directory",
         guarded.replace("?host=", "?port=none&host="): "cannot be opened: .*port",
