@@ -18,7 +18,7 @@ import pytest
 
 from attentionvote import tracking
 from attentionvote.tracking.server import free_port
-from attentionvote.tracking.store import connect
+from attentionvote.tracking.store import connect, experiment_id
 
 pytestmark = pytest.mark.slow
 MODEL = "attentionvote-bracket"
@@ -214,3 +214,7 @@ def test_a_cells_user_follows_the_champion_and_moves_nothing(server, as_user, tm
     for request in (path(alias, alias="champion"), path(artifact, version=version, path="model.onnx")):
         assert server.ask(request)[0] == 401
     assert client.get_model_version_by_alias(MODEL, "champion").version == version
+    as_user("cell7")
+    for known in ("bracket", "new"):
+        with pytest.raises(PermissionError, match=f"write to experiment '{known}', it does not .HTTP 403.: its admin"):
+            experiment_id(connect(server.url), server.url, known)

@@ -212,19 +212,37 @@ def connect(uri: str) -> MlflowClient:
 
 
 def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
-    """Id of the experiment, created when new and restored when it had been deleted in the UI."""
+    """Id of the experiment, created when new and restored when it had been deleted in the UI.
+
+    Raises:
+        PermissionError: a server lets this user not write to it.
+    """
+    from mlflow.exceptions import MlflowException
+
+    try:
+        with exclusive(uri):
+            return _found_or_made(client, uri, name)
+    except MlflowException as error:
+        if error.get_http_status_code() != 403:
+            raise
+        raise PermissionError(
+            f"tracking server {shown(uri)} must let this user write to experiment {name!r}, it does not (HTTP 403): "
+            "its administrator grants EDIT on it"
+        ) from error
+
+
+def _found_or_made(client: MlflowClient, uri: str, name: str) -> str:
     from mlflow.exceptions import MlflowException
 
     root = artifact_root(uri)
-    with exclusive(uri):
-        experiment = client.get_experiment_by_name(name)
-        if experiment is None:
-            try:
-                return client.create_experiment(name, artifact_location=root.as_uri() if root else None)
-            except MlflowException:  # somebody else was faster (a server or database has no file lock of ours)
-                experiment = client.get_experiment_by_name(name)
-                if experiment is None:
-                    raise
-        if experiment.lifecycle_stage == "deleted":
-            client.restore_experiment(experiment.experiment_id)
-        return experiment.experiment_id
+    experiment = client.get_experiment_by_name(name)
+    if experiment is None:
+        try:
+            return client.create_experiment(name, artifact_location=root.as_uri() if root else None)
+        except MlflowException:  # somebody else was faster (a server has no lock of ours)
+            experiment = client.get_experiment_by_name(name)
+            if experiment is None:
+                raise
+    if experiment.lifecycle_stage == "deleted":
+        client.restore_experiment(experiment.experiment_id)
+    return experiment.experiment_id
