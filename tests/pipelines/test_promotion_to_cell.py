@@ -71,9 +71,8 @@ class Customer:
         """Until an answer is of this bundle."""
         until = time.monotonic() + patience_s
         while self.models[-1:] != [digest[:12]]:
-            assert time.monotonic() < until and not self.failures, (
-                f"waited for {digest[:12]}, got {self.models[-1:]} {self.failures[-1:]}"
-            )
+            assert not self.failures
+            assert time.monotonic() < until, f"waited in vain for {digest[:12]}, got {self.models[-1:]}"
             time.sleep(0.02)
 
     def _ask(self) -> None:
