@@ -35,7 +35,7 @@ make(folder, make_keys(folder / "keys"))("bundle", golden=3)
 def signed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
     """A bundle and the public key that signed it."""
     folder = tmp_path_factory.mktemp("bench")
-    builder = ROOT / "tests" / "inference" / "conftest.py"
+    builder = ROOT / "tests" / "fixtures" / "tiny_bundle.py"
     words = [sys.executable, "-c", BUILDER, str(builder), str(folder)]
     subprocess.run(words, check=True, timeout=120, stdout=subprocess.DEVNULL)
     yield folder / "bundle", folder / "keys" / "signing.pub"
