@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from attentionvote.inference.server import serve
+from attentionvote.inference.server.source import source_of
 
 ROOT = Path(__file__).resolve().parents[2]
 USER = "65532:65532"
@@ -69,12 +70,15 @@ def test_only_the_state_can_be_written(compose: dict[str, Any], stages: dict[str
 
 
 def test_the_cell_serves_its_folder_until_it_is_told_to_follow_a_registry(
-    compose: dict[str, Any], stages: dict[str, Any], interpolate: Callable[..., str]
+    compose: dict[str, Any],
+    stages: dict[str, Any],
+    interpolate: Callable[..., str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     command, file = compose["services"]["inference"]["command"], compose["secrets"]["registry"]["file"]
     plain = shlex.split(interpolate(command))
-    assert plain[: len(stages["inference"]["CMD"])] == stages["inference"]["CMD"]
-    assert plain[len(stages["inference"]["CMD"]) :] == ["--registry", "http://mlflow:5000"]
+    assert plain== stages["inference"]["CMD"]
     assert interpolate(file) == "/dev/null"
     told = {
         "CELL_MODEL": "models:/attentionvote-gear@champion",
@@ -83,11 +87,26 @@ def test_the_cell_serves_its_folder_until_it_is_told_to_follow_a_registry(
     }
     words = shlex.split(interpolate(command, **told))
     assert words[:2] == ["serve", told["CELL_MODEL"]]
-    assert words[-4:] == ["--registry", "https://team", "--registry-auth-file", "/run/secrets/registry"]
+    assert words[-2:] == ["--registry-auth-file", "/run/secrets/registry"]
     assert interpolate(file, **told) == "f"
     parser = argparse.ArgumentParser()
     serve.add_arguments(parser)
-    assert parser.parse_args(words[1:]).registry_auth_file == Path("/run/secrets/registry")
+    address = compose["services"]["inference"]["environment"]["MLFLOW_TRACKING_URI"]
+    (tmp_path / "registry").write_text("cell7:p\n", encoding="utf-8")
+    words[-1] = str(tmp_path / "registry")
+    for name in ("MLFLOW_TRACKING_USERNAME", "MLFLOW_TRACKING_PASSWORD"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", interpolate(address))
+    folder = source_of(parser.parse_args(plain[1:]))
+    assert (folder.name, folder.access) == (Path("/bundles/latest"), None)
+    alone = shlex.split(interpolate(command, CELL_MODEL=told["CELL_MODEL"]))
+    followed = source_of(parser.parse_args(alone[1:])).access
+    assert followed is not None
+    assert (followed.url, followed.authorization) == ("http://mlflow:5000", None)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", interpolate(address, **told))
+    followed = source_of(parser.parse_args(words[1:])).access
+    assert followed is not None
+    assert (followed.url, followed.authorization is not None) == ("https://team", True)
 
 
 def ask(port: int, host: str) -> int:

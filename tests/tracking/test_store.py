@@ -66,6 +66,9 @@ def test_resolve_store_rejects_with_the_nearest_choice(store, sentence):
         ("postgresql://me@db:5432/x", "postgresql://me@db:5432/x"),
         ("sqlite:////data/mlflow.db", "sqlite:////data/mlflow.db"),
         ("http://127.0.0.1:5000", "http://127.0.0.1:5000"),
+        ("https://token@host", "https://***@host"),
+        ("https://me:p@host:5000/mlflow", "https://***@host:5000/mlflow"),
+        ("https://host/a@b", "https://host/a@b"),
     ],
 )  # fmt: skip
 def test_shown_hides_passwords_and_nothing_else(store, said):
