@@ -78,7 +78,7 @@ def test_the_cell_serves_its_folder_until_it_is_told_to_follow_a_registry(
 ) -> None:
     command, file = compose["services"]["inference"]["command"], compose["secrets"]["registry"]["file"]
     plain = shlex.split(interpolate(command))
-    assert plain== stages["inference"]["CMD"]
+    assert plain == stages["inference"]["CMD"]
     assert interpolate(file) == "/dev/null"
     told = {
         "CELL_MODEL": "models:/attentionvote-gear@champion",

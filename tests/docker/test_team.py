@@ -258,3 +258,32 @@ def test_runs_versions_and_their_files_go_through_it_and_come_back_from_a_backup
     found = postgresql.run("select name, version from registered_model_aliases where alias = 'champion'", again)
     postgresql.drop(again)
     assert found == f"{versions.name}|{version.number}"
+
+
+@pytest.mark.slow
+def test_a_repeat_takes_rights_away_and_takes_up_a_killed_runs_password(team: Team) -> None:
+    def rights(*words: str) -> set[tuple[str, str, str]]:
+        script = [sys.executable, ROOT / "docker" / "team_user.py", *words, "--server", team.url]
+        done = subprocess.run([*script, "--secrets", team.secrets], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        listed = "/api/3.0/mlflow/users/permissions/list?username=cell9"
+        status, body = team.ask(listed, f"admin:{team.secret('admin_password')}")
+        assert status == 200
+        keys = ("resource_type", "resource_pattern", "permission")
+        return {tuple(row[key] for key in keys) for row in json.loads(body)["permissions"]}
+
+    closed = ("experiment", "*", "DENY")
+    gear, rod = (("registered_model", f"attentionvote-{part}", "READ") for part in ("gear", "rod"))
+    assert rights("cell", "cell9", "gear", "rod") == {closed, gear, rod}
+    file, pending = team.secrets / "cell9.auth", team.secrets / "cell9.auth.new"
+    login = team.secret("cell9.auth")
+    file.rename(pending)  # as a run leaves it that was killed after the server had made the user
+    assert rights("cell", "cell9", "gear") == {closed, gear}
+    assert team.secret("cell9.auth") == login
+    assert not pending.exists()
+    file.chmod(0o644)
+    person = {("experiment", "*", "EDIT"), ("registered_model", "*", "EDIT")}
+    assert rights("person", "cell9") == person
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert team.secret("cell9.auth") == login
+    assert rights("cell", "cell9", "rod") == {closed, rod}

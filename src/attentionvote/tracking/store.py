@@ -82,7 +82,7 @@ def resolve_store(store: str | None) -> str:
 
 
 def shown(store: str) -> str:
-    """The store's URI as people and logs may see it: without its password, for a server without all that may be a token."""
+    """The store's URI as people and logs may see it: without its password; a server's without its user too."""
     store = re.sub(r"(?i)^(https?://)[^/?#]*@", r"\1***@", store)
     store = re.sub(r"^([\w+.-]+://[^:/?@]*):.*@", r"\1:***@", store)
     return re.sub(r"(?i)([?&][a-z]*(?:password|secret)=)[^&]*", r"\1***", store)
