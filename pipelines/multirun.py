@@ -24,8 +24,6 @@ log = logging.getLogger("attentionvote.multirun")
 Compose = Callable[[Sequence[str]], DictConfig]
 Check = Callable[[DictConfig], object]
 SEVERAL = "grids"  # the experiment of a grid over several parts
-# What does not make it another grid: how the jobs are run, not what they are.
-_NOT_IDENTITY = ("resume", "force", "workers", "executor", "cluster", "tracking", "root", "outputs")
 
 
 def run_grid(verb: str, words: Sequence[str], machine: Sequence[str], compose: Compose, check: Check | None) -> None:
@@ -94,13 +92,18 @@ def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurat
     first = configurations[0]
     if OmegaConf.select(first, "tracking.parent", default=0) == 0:
         return None
+    from training_job import NOT_IDENTITY
+
     from attentionvote.tracking.group_run import open_group
 
     contents = []
     for configuration in configurations:
         plain = OmegaConf.to_container(configuration, resolve=True)
         assert isinstance(plain, dict)
-        contents.append(json.dumps({k: v for k, v in plain.items() if k not in _NOT_IDENTITY}, sort_keys=True))
+        for key in NOT_IDENTITY:  # how the jobs are run, not what they are
+            section, _, leaf = key.rpartition(".")
+            (plain.get(section, {}) if section else plain).pop(leaf, None)
+        contents.append(json.dumps(plain, sort_keys=True))
     digest = hashlib.sha256("\n".join([verb, *sorted(contents)]).encode()).hexdigest()
     parts = {configuration.object.name for configuration in configurations}
     run = open_group(

@@ -74,6 +74,7 @@ RANGES: tuple[Range, ...] = (
     Range("signing_keys", kind=str),
     Range("triton", kind=str),
     Range("trusted_key", kind=str),
+    Range("champion_key", kind=str),
     Range("to", low=1, kind=int),
     Range("last", low=1),
     Range("trials", low=1),
@@ -202,7 +203,7 @@ def violation(key: str, value: Any) -> str:
         if has_password(value):
             return (
                 f"{key} must not hold a password, because settings are kept with every run; got {shown(value)!r}: "
-                "set MLFLOW_TRACKING_URI or PGPASSWORD"
+                + ("set MLFLOW_TRACKING_URI or PGPASSWORD" if key == "tracking.store" else "set PGPASSWORD")
             )
     for item in _scalars(value):
         if not allowed.accepts(item):

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from command import command, configuring
-from configuration import CONF, parse, primary_groups
+from configuration import CONF, ConfigurationError, parse, primary_groups
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_hardware
 
@@ -28,7 +28,11 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     from sweep_job import SweepJob
     from sweep_report import check_save_as
 
-    check_save_as(cfg.save_as)
+    if cfg.executor != "local":
+        raise ConfigurationError(
+            f"executor must be local for a sweep, whose trials are processes of this machine; got {cfg.executor!r}"
+        )
+    check_save_as(cfg.save_as, words=words)
     with configuring():
         job = SweepJob(cfg, training_words(words), _space_name(words))
     with locked_folder(job.folder, cfg.sweeps, "sweep"):

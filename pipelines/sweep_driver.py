@@ -21,6 +21,7 @@ from trial_place import PRUNED_AT, PRUNED_CODE
 log = logging.getLogger("attentionvote.sweep")
 TRAIN = Path(__file__).with_name("train.py")
 _POLL_S = 0.1
+_LOCK_S = 1.0  # between looks at a lock that somebody else holds
 
 
 @dataclass
@@ -68,8 +69,8 @@ class SweepDriver:
         self.logs, self.ended, self.script = logs, ended, script
         self.running: list[Running] = []
         self.lost: deque[FrozenTrial] = deque()
-        self.waiting: deque[tuple[Trial, dict[str, Any]]] = deque()  # somebody else is at their training
-        self._beaten_s = -float("inf")
+        self.waiting: deque[tuple[Trial, dict[str, Any], Path]] = deque()  # somebody else is at their training
+        self._beaten_s = self._looked_s = -float("inf")
 
     def run(self, total: int, tick: Callable[[], object]) -> None:
         """Run until the study has ``total`` trials and all of them have ended.
@@ -99,29 +100,34 @@ class SweepDriver:
                 running.files.close()
 
     def _start(self, total: int) -> None:
-        for _ in range(len(self.waiting)):
-            trial, values = self.waiting.popleft()
-            self._launch_or_wait(trial, values)
+        if time.monotonic() - self._looked_s >= _LOCK_S:
+            self._looked_s = time.monotonic()
+            for _ in range(len(self.waiting)):
+                self._launch_or_wait(*self.waiting.popleft())
         while len(self.running) + len(self.waiting) < self.workers:
+            lost: FrozenTrial | None = None
             if self.lost:
                 lost = self.lost.popleft()
                 trial, values = self.ledger.begin(lost)
-                if PRUNED_AT in lost.user_attrs:  # decided, but nobody was there to write it down
-                    self._end(trial, self.directory(values), TrialState.PRUNED)
-                    continue
             elif len(self.ledger.trials) < total:
                 trial, values = self.ledger.begin()
             else:
                 return
-            self._launch_or_wait(trial, values)
+            try:
+                directory = self.directory(values)
+            except (ValueError, OSError) as error:  # each value is fine alone, but not all of them together
+                self._end(trial, None, TrialState.FAIL, reason=" ".join(str(error).split()))
+                continue
+            if lost is not None and PRUNED_AT in lost.user_attrs:  # decided, but nobody was there to write it down
+                self._end(trial, directory, TrialState.PRUNED)
+                continue
+            self._launch_or_wait(trial, values, directory)
 
-    def _launch_or_wait(self, trial: Trial, values: dict[str, Any]) -> None:
-        directory = self.directory(values)
+    def _launch_or_wait(self, trial: Trial, values: dict[str, Any], directory: Path) -> None:
         # Another trial with the same values, or what a killed sweep left for some seconds.
         taken = any(running.directory == directory for running in self.running) or is_locked(directory)
         if taken or len(self.running) >= self.workers:
-            if not any(waiting is trial for waiting, _ in self.waiting):
-                self.waiting.append((trial, values))
+            self.waiting.append((trial, values, directory))
             return
         files = ExitStack()
         stderr = files.enter_context((self.logs / f"trial_{trial.number:03d}.log").open("ab"))
@@ -159,12 +165,15 @@ class SweepDriver:
         else:
             self._end(trial, running.directory, TrialState.FAIL, reason=outcome.sentence, **about)
 
-    def _end(self, trial: Trial, directory: Path, state: TrialState, value: float | None = None, **about: Any) -> None:
+    def _end(
+        self, trial: Trial, directory: Path | None, state: TrialState, value: float | None = None, **about: Any
+    ) -> None:
         # For whoever looks at the study with another tool; relative, as the settings are.
-        self.ledger.end(trial, state, value, directory=os.fspath(directory), **about)
+        place = {} if directory is None else {"directory": os.fspath(directory)}
+        self.ledger.end(trial, state, value, **place, **about)
         self.ended(self.ledger.trials[trial.number])
 
     def _beat(self) -> None:
         if time.monotonic() - self._beaten_s >= self.heartbeat_s:
-            self.ledger.beat([running.trial for running in self.running] + [trial for trial, _ in self.waiting])
+            self.ledger.beat([running.trial for running in self.running] + [trial for trial, _, _ in self.waiting])
             self._beaten_s = time.monotonic()

@@ -15,7 +15,7 @@ from sweep_driver import SweepDriver
 from sweep_progress import SweepProgress
 from sweep_report import experiment_text, importances, run_of, write_table, write_whole
 from sweep_space import parse_space
-from sweep_study import Ledger, make_pruner, open_study, study_name, without_password
+from sweep_study import Ledger, make_pruner, open_study, study_name
 from training_job import find_training
 from trial_place import for_trial
 
@@ -86,7 +86,7 @@ class SweepJob:
             self.training.tracking.store, self.part, f"sweep {self.name}", self.name,
             params={"study": self.name, **{f"space.{s.name}": ", ".join(map(str, s.extremes)) for s in self.space}},
             tags={"sweep.study": self.name, "sweep.trials": total},
-            config_yaml=OmegaConf.to_yaml(self._shown(), resolve=True), parent=self.cfg.tracking.parent,
+            config_yaml=OmegaConf.to_yaml(self.cfg, resolve=True), parent=self.cfg.tracking.parent,
         ) as parent:  # fmt: skip
             self.parent = parent
             with SweepProgress(max(total, done + lost), done, self.workers, self.space) as progress:
@@ -100,12 +100,6 @@ class SweepJob:
                 finally:
                     write_table(ledger, self.folder)
             return self._report()
-
-    def _shown(self) -> DictConfig:
-        """The configuration without the database's password."""
-        shown = self.cfg.copy()
-        shown.storage = without_password(self.cfg.storage) if self.cfg.storage else None
-        return shown
 
     def words(self, values: Mapping[str, Any]) -> list[str]:
         """The words of a trial's training."""

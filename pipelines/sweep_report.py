@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -125,21 +126,42 @@ def _put(settings: dict[str, Any], key: str, value: Any) -> None:
     settings[leaf] = value
 
 
-def check_save_as(name: str | None, experiments: Path = CONF / "experiment") -> None:
-    """Refuse a name that is no file name, or that is a file of the user's.
+def check_save_as(name: str | None, experiments: Path = CONF / "experiment", words: Sequence[str] = ()) -> None:
+    """Refuse a name that is no file name, that is a file of the user's, or that the experiment of the words builds on.
 
     Raises:
         ConfigurationError: with one sentence.
     """
     if name is None:
         return
-    if not name.replace("-", "_").isidentifier():
+    if not re.fullmatch(r"[\w-]+", name, re.ASCII):
         raise ConfigurationError(f"save_as must be a name of letters, digits, - and _, got {name!r}")
     path = experiments / f"{name}.yaml"
     if path.exists() and MARK not in path.read_text(encoding="utf-8"):
         raise ConfigurationError(
             f"save_as must not replace a file that no sweep wrote, got {name!r}: choose another name"
         )
+    chosen = [o.value() for o in parse(words) if o.key_or_group == "experiment" and not o.is_delete()][-1:]
+    if name in _built_on(chosen, experiments):
+        raise ConfigurationError(
+            f"save_as must not name an experiment that the sweep builds on, or its file would build on itself, got "
+            f"{name!r}: choose another name"
+        )
+
+
+def _built_on(names: Sequence[Any], experiments: Path) -> set[str]:
+    """The experiments of these names and all that stand in their defaults."""
+    found: set[str] = set()
+    rest = [str(name) for name in names if name is not None]
+    while rest:
+        name = rest.pop()
+        path = experiments / f"{name}.yaml"
+        if name in found or not path.is_file():
+            continue
+        found.add(name)
+        defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
+        rest += [entry for entry in defaults if isinstance(entry, str)]
+    return found
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -1,7 +1,7 @@
 """What a sweep and the process of a trial agree on; knows neither torch nor Optuna.
 
-A trial is an ordinary training. The sweep that starts it says so in one variable of the environment, because the
-study's database may have a password, which belongs into no command line and no tracked configuration.
+A trial is an ordinary training. The sweep that starts it says so in one variable of the environment, because
+whose trial it is does not belong to the settings of the training.
 """
 
 from __future__ import annotations

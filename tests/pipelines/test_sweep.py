@@ -154,6 +154,8 @@ def test_a_sweep_of_failures_says_why(words: list[str], tmp_path: Path, caplog: 
         ("trainer.validate_every=9", "trainer.max_epochs must be at least trainer.validate_every"),
         ("sweep.space=[{name: seed, kind: int, low: 2, high: 1}]", "low must be less than high, got 2 and 1"),
         ("save_as=paper", "save_as must not replace a file that no sweep wrote, got 'paper'"),
+        ("save_as=smoke", "save_as must not replace a file that no sweep wrote"),
+        ("executor=ray", "executor must be local for a sweep.*got 'ray'"),
         ("save_as=a/b", "save_as must be a name of letters, digits, - and _, got 'a/b'"),
         ("storage=nonsense", "storage must be the SQLAlchemy URI of a database that answers.*got nonsense"),
         ("~trainer.log_every_steps", "takes no word that deletes a setting"),
@@ -199,3 +201,8 @@ def test_an_experiment_says_what_the_sweep_was_given(tmp_path: Path) -> None:
     # A file that a sweep wrote may be written again.
     assert MARK in text
     check_save_as("mine", conf / "experiment")
+    check_save_as("2024mine", conf / "experiment")
+    for name in ("mine", "next"):  # chosen itself, and reachable from the chosen one
+        (conf / "experiment" / "next.yaml").write_text(f"# {MARK}\ndefaults: [mine, _self_]\n", encoding="utf-8")
+        with pytest.raises(ConfigurationError, match="save_as must not name an experiment that the sweep builds on"):
+            check_save_as(name, conf / "experiment", ["experiment=next"])

@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from optuna.trial import TrialState
@@ -205,3 +206,21 @@ def test_ctrl_c_ends_the_trials_orderly_and_they_go_on(tmp_path: Path, does: Doe
     assert states(ledger) == ["COMPLETE"] * 3
     assert ledger.count(TrialState.COMPLETE) == 3
     assert len(list((tmp_path / "logs").iterdir())) == 3
+
+
+@pytest.mark.usefixtures("does")
+def test_an_impossible_combination_fails_its_trial_and_no_other(tmp_path: Path) -> None:
+    ledger, sweep = driver(tmp_path)
+    place = sweep.directory
+    seen: list[Mapping[str, Any]] = []
+
+    def directory(values: Mapping[str, Any]) -> Path:
+        seen.append(values)
+        if len(seen) == 2:
+            raise ValueError("model.widths must fit model.centers")
+        return place(values)
+
+    sweep.directory = directory
+    sweep.run(3, lambda: None)
+    assert states(ledger) == ["COMPLETE", "FAIL", "COMPLETE"]
+    assert ledger.trials[1].user_attrs["reason"] == "model.widths must fit model.centers"
