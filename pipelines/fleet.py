@@ -43,7 +43,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     from fleet_member import MemberTask
     from folder_lock import locked_folder
 
-    training = [*preset_of_hardware(list(words)), *training_words(words)]
+    training = [*preset_of_workers(cfg, words), *training_words(words)]
     with configuring():
         executor = executor_of(cfg)
     jobs, left_out = members(cfg.objects, training)
@@ -54,9 +54,10 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     folder = Path(cfg.fleets)
     here = cfg.executor == "local" and workers == 1
     own = () if here else (f"workers={threads}", f"trainer.threads={threads}")
-    member_words, places = words_of_verbs(cfg, (*training, *own), next(iter(jobs)))
+    # The user's words come last: a number of threads that was asked for is kept.
+    member_words, places = words_of_verbs(cfg, (*own, *training), next(iter(jobs)))
     task = MemberTask(member_words, None if here else folder / "logs")
-    with locked_folder(folder, cfg.fleets, "fleet"):
+    with locked_folder(folder, cfg.fleets, "fleet", "fleets"):
         answers = _run(task, list(jobs), executor, workers, cfg.retries, threads)
         rows = [
             fleet_board.row(name, jobs[name], answers[name], places["bundles"], Path(cfg.root), cfg.tracking.store)
@@ -78,6 +79,18 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         told = "; ".join(f"{name} failed, {reason}" for name, reason in failures.items())
         raise Refused(f"{len(failures)} of {len(rows)} parts are not done: {told}", result)
     return result
+
+
+def preset_of_workers(cfg: DictConfig, words: Sequence[str]) -> list[str]:
+    """The preset of the machines that train: of this one, or on a cluster what the jobs are given.
+
+    The machine that submits says nothing about those that train: a cluster's jobs have a GPU when they ask for one.
+    """
+    if cfg.executor == "local" or any(word.lstrip("+~").startswith("experiment") for word in words):
+        return preset_of_hardware(list(words))
+    preset = "gpu" if cfg.cluster.gpus > 0 else "compact"
+    log.info("experiment=%s, because cluster.gpus=%s (experiment=... chooses another)", preset, cfg.cluster.gpus)
+    return [f"experiment={preset}"]
 
 
 def training_words(words: Sequence[str]) -> list[str]:
@@ -172,4 +185,11 @@ def _run(
 
 
 if __name__ == "__main__":
-    command("fleet", lambda cfg: run(cfg, sys.argv[1:]), defaults=preset_of_hardware)
+    preset: list[str] = []
+
+    def presets(words: list[str]) -> list[str]:
+        """The preset of the trainings, chosen and said once."""
+        preset[:] = preset_of_workers(compose("fleet", words), words)
+        return preset
+
+    command("fleet", lambda cfg: run(cfg, [*preset, *sys.argv[1:]]), defaults=presets)

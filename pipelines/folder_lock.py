@@ -11,13 +11,14 @@ from configuration import ConfigurationError
 
 
 @contextmanager
-def locked_folder(folder: Path, outputs: str, work: str) -> Iterator[None]:
+def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs") -> Iterator[None]:
     """Make the folder and be the only process in it.
 
     Args:
         folder: created when missing.
         outputs: the setting's value, for the sentence when it cannot be written.
         work: what is done there, for the sentence when another process does it.
+        setting: its name.
 
     Raises:
         ConfigurationError: when the folder cannot be written, or another process is in it.
@@ -26,7 +27,7 @@ def locked_folder(folder: Path, outputs: str, work: str) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")
     except OSError as error:
-        raise ConfigurationError(f"outputs={outputs} cannot be written: {error.strerror or error}") from error
+        raise ConfigurationError(f"{setting}={outputs} cannot be written: {error.strerror or error}") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, also on kill -9

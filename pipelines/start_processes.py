@@ -26,6 +26,7 @@ def main() -> int:
 
     logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)
     try:
+        _check_processes(sys.argv[1:])
         torchrun()
     except SignalException as ended:
         return 130 if ended.sigval == signal.SIGINT else 128 + int(ended.sigval)
@@ -36,7 +37,27 @@ def main() -> int:
             print(f"train: process {rank + 1} was ended by {name}", file=sys.stderr)
             return 128 - first.exitcode
         return first.exitcode
+    except ValueError as error:
+        print(f"train: {error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        print(f"train: torchrun failed: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+        return 1
     return 0
+
+
+def _check_processes(words: list[str]) -> None:
+    """Whether the number of processes is one; torchrun also knows words for it.
+
+    Raises:
+        ValueError: when it is not.
+    """
+    for word in words:
+        name, _, asked = word.partition("=")
+        if name != "--nproc-per-node" or asked in ("auto", "cpu", "gpu", "xpu"):
+            continue
+        if not (asked.isdecimal() and int(asked) > 0):
+            raise ValueError(f"PROCESSES must be a whole number of at least 1, got {asked or 'nothing'}")
 
 
 if __name__ == "__main__":

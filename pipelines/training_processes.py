@@ -96,11 +96,11 @@ class Place:
     @contextmanager
     def joined(self, accelerator: str) -> Iterator[FirstDoes]:
         """Meet the others; yields what lets the first work alone while they wait."""
+        if "TORCHELASTIC_RUN_ID" in os.environ:  # torchrun killed with -9 leaves no orphans that hold the folder
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if self.processes == 1:
             yield lambda _, work: work()
             return
-        if "TORCHELASTIC_RUN_ID" in os.environ:  # torchrun killed with -9 leaves no orphans that hold the folder
-            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         # torch warns, from C++, that looking for unused parameters costs time where the first step has none.
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         import torch

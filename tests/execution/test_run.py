@@ -90,6 +90,12 @@ def test_workers_have_their_threads_and_our_folder(executor: Executor) -> None:
     assert {name: os.environ.get(name) for name in names} == before
 
 
+def test_a_job_of_ray_that_takes_no_gpu_sees_none(ray_cluster: RayCluster) -> None:
+    name = "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"  # hides GPUs, which a machine without any cannot show
+    ((_, (_, value, _)),) = run_all(environment, [name], ray_cluster, workers=2)
+    assert value == "1"
+
+
 def test_leaving_early_ends_the_workers(executor: Executor, marks: Path) -> None:
     with closing(run_all(Marked(marks, seconds=1.0), list(range(20)), executor, workers=2)) as results:
         next(results)

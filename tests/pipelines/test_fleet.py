@@ -81,6 +81,13 @@ def test_words_of_the_training_are_handed_on_and_those_of_the_fleet_are_not() ->
         fleet.training_words(["object=gear"])
 
 
+@pytest.mark.parametrize(("gpus", "preset"), [("1.0", "gpu"), ("0", "compact")])
+def test_on_a_cluster_the_jobs_choose_the_preset_not_the_submitting_machine(gpus: str, preset: str) -> None:
+    words = ["executor=slurm", f"cluster.gpus={gpus}"]
+    assert fleet.preset_of_workers(compose("fleet", words), words) == [f"experiment={preset}"]
+    assert fleet.preset_of_workers(compose("fleet", words), [*words, "experiment=paper"]) == []
+
+
 def test_exports_and_evaluations_lie_beside_the_trainings() -> None:
     said = ["outputs=o/train", "root=d", "tracking.store=s.db", "export=['signing_keys=k','scenes=40']"]
     words, places = fleet.words_of_verbs(compose("fleet", said), ["seed=3"], "brick")

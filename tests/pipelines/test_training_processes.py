@@ -127,6 +127,16 @@ def test_a_refusal_is_said_once_a_machine_and_at_once(start: Start, tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("processes", ["0", "abc"])
+def test_a_number_of_processes_that_is_none_is_one_sentence(processes: str) -> None:
+    words = ["--standalone", f"--nproc-per-node={processes}", "pipelines/train.py", "object=gear"]
+    answer = subprocess.run(
+        [sys.executable, "pipelines/start_processes.py", *words], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert answer.stderr == f"train: PROCESSES must be a whole number of at least 1, got {processes}\n"
+    assert (answer.returncode, answer.stdout) == (2, "")
+
+
 def test_another_process_only_says_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     broken = RuntimeError("[../gloo/transport/tcp/pair.cc:547] Connection closed by peer [127.0.0.1]:31")
 

@@ -109,13 +109,13 @@ class _Pool:
             if not worker.ready:
                 worker.line.send_bytes(self.task)
                 worker.ready = True
-            worker.job = self.waiting.popleft() if self.waiting else None
-            if worker.job is None:
+            if not self.waiting:
                 self.workers.remove(worker)
                 worker.line.close()  # it ends when it reads the end of the line
                 self.leaving.append(worker)
             else:
-                worker.line.send_bytes(pickle.dumps(self.jobs[worker.job]))
+                worker.line.send_bytes(pickle.dumps(self.jobs[self.waiting[0]]))
+                worker.job = self.waiting.popleft()  # one that died while idle was not at it
         except (BrokenPipeError, ConnectionResetError):
             pass  # it died this moment: its end is the next event
 

@@ -17,6 +17,7 @@ from attentionvote.execution.failures import Attempts
 from attentionvote.execution.outcome import perform, worker_environment
 
 _OBJECT_STORE = 512 * 2**20  # bytes, of a cluster of this machine: results wait here for a moment only
+_NO_GPU = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "1"}  # else Ray leaves a job that takes none all of them
 _held: tuple[str, Callable[[Any], Any]] | None = None  # of a worker process: a call's token and its task
 
 
@@ -102,7 +103,7 @@ class RayCluster:
             num_cpus=threads,
             num_gpus=self.gpus,
             max_retries=0,  # counted here, as everywhere
-            runtime_env={"env_vars": worker_environment(threads)},
+            runtime_env={"env_vars": worker_environment(threads) | ({} if self.gpus else _NO_GPU)},
         )
         token, stored = uuid.uuid4().hex, ray.put(pickle.dumps(task))
         waiting = list(reversed(range(len(jobs))))
