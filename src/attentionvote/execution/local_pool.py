@@ -105,6 +105,7 @@ class _Pool:
 
     def _employ(self, worker: _Worker) -> None:
         """Give the worker the next job, or let it go."""
+        worker.job = None  # the last one is done
         try:
             if not worker.ready:
                 worker.line.send_bytes(self.task)
