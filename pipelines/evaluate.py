@@ -36,11 +36,11 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         result = read_json(place)
         if result is not None and not cfg.force:
             log.info("this evaluation is done (force=true repeats it): %s", place)
-            show(result)
-            return result
-        result = described(job, frozen, job.measure([job.bundle], frozen)[0])
-        write_json(place, result)
+        else:
+            result = described(job, frozen, job.measure([job.bundle], frozen)[0])
+            write_json(place, result)
         show(result)
+        # Also when it is done: the store may have been away.
         record(cfg.tracking.store, job.bundle.card.run_id, result, json.dumps(result, indent=2))
     return result
 

@@ -109,7 +109,7 @@ def _folder(place: Path, name: str, part: str) -> Path:
     """The bundle's folder below ``place``: ``latest``, or the only one whose name begins with ``name``."""
     if name == "latest" and (place / name).exists():
         return place / name
-    found = [path for path in sorted(place.glob(f"{name}*")) if path.is_dir() and not path.is_symlink()]
+    found = [p for p in sorted(place.glob("*")) if p.name.startswith(name) and p.is_dir() and not p.is_symlink()]
     if len(found) == 1:
         return found[0]
     have = [

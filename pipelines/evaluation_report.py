@@ -83,5 +83,5 @@ def record(store: str | None, run_id: str, result: Mapping[str, Any], text: str)
         if not run_id:
             raise ValueError("the model's card names no run")
         add_to_run(store, run_id, metrics, tags, {name: text})
-    except (ValueError, ConnectionError) as error:
-        log.warning("the figures are not in the training's run: %s", error)
+    except (ValueError, OSError) as error:
+        log.warning("the figures are not in the training's run, the same command tries again: %s", error)

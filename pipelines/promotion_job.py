@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evaluation_job import EvaluationJob
+from configuration import ConfigurationError
+from evaluation_job import EvaluationJob, trusted_key
 from evaluation_report import described, show
 from omegaconf import DictConfig
 from refusal import Refused
 
 from attentionvote.export import Limits
-from attentionvote.inference import Bundle, BundleError, load_bundle
+from attentionvote.inference import Bundle
 from attentionvote.registry.gates import Evidence, Gate, Rules, judge
 from attentionvote.registry.history import History
 from attentionvote.registry.measurement import EvaluationSet, Measurement
@@ -35,6 +36,7 @@ class PromotionJob:
     history: History
     standing: Standing
     why: str
+    champion_key: str | None
 
     @classmethod
     def find(cls, cfg: DictConfig) -> PromotionJob:
@@ -55,12 +57,12 @@ class PromotionJob:
         standing = stand(versions, history)
         if standing.astray:
             log.warning("%s", standing.astray)
-        return cls(evaluation, rules, versions, history, standing, cfg.why)
+        return cls(evaluation, rules, versions, history, standing, cfg.why, cfg.champion_key)
 
     def already(self) -> dict[str, Any] | None:
-        """The answer when the candidate is the champion; None otherwise."""
+        """The answer when the candidate is the champion by a decision of ours; None otherwise."""
         champion, bundle = self.standing.champion, self.evaluation.bundle
-        if champion is None or champion.digest != bundle.digest:
+        if champion is None or champion.digest != bundle.digest or self.standing.astray:
             return None
         log.info("%s: bundle %s is the champion, version %d", self.name, bundle.digest[:12], champion.number)
         return self._answer(champion)
@@ -76,9 +78,9 @@ class PromotionJob:
         Raises:
             Refused: when a gate fails, or somebody else moved the champion meanwhile.
         """
-        frozen = self.evaluation.evaluation_set()
         with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
-            champion = self._champion(Path(folder))
+            champion, uncompared = self._champion(Path(folder))
+            frozen = self.evaluation.evaluation_set()
             bundles = [self.evaluation.bundle, *([champion] if champion else [])]
             measured = self.evaluation.measure(bundles, frozen)
         report = described(self.evaluation, frozen, measured[0])
@@ -88,10 +90,11 @@ class PromotionJob:
         gates = judge(
             self.rules, evidence[0], evidence[1] if champion else None, self.evaluation.bundle.card, origin, len(frozen)
         )
-        _show_gates(gates, self._against())
+        against = uncompared or f"against champion version {self.standing.champion.number}"  # type: ignore[union-attr]
+        _show_gates(gates, against)
         failed = [gate for gate in gates if not gate.holds]
         facts = {f"gate.{gate.name}": str(gate) for gate in gates}
-        facts |= {"evaluation.set": frozen.digest, "machine": report["machine"]}
+        facts |= {"evaluation.set": frozen.digest, "machine": report["machine"], "compared": against}
         version = self.versions.register(
             self.evaluation.bundle, facts | {"decision": "refused" if failed else "passed"}
         )
@@ -108,35 +111,37 @@ class PromotionJob:
         try:
             move(self.versions, self.history, self.standing, "promote", version, self.why, facts)
         except Superseded as error:
+            self.versions.tag(version, {"decision": "superseded"})
             raise Refused(str(error), answer) from error
         self.versions.tag(version, {"decision": "promoted"})
         log.info("%s: version %d is the champion now%s", self.name, version.number, self._instead())
         return answer | {"promoted": True, "champion": version.number}
 
-    def _champion(self, folder: Path) -> Bundle | None:
-        """The champion's bundle, from the registry."""
+    def _champion(self, folder: Path) -> tuple[Bundle | None, str]:
+        """The champion's bundle from the registry, or None and why nothing is compared.
+
+        Raises:
+            ConfigurationError: when there is a champion that cannot be measured, and what to do about it.
+        """
         champion = self.standing.champion
         if champion is None:
-            return None
-        place = self.versions.fetch(champion, folder)
+            return None, "no champion" if self.standing.ever else "no champion yet"
+        trusted = self.evaluation.key if self.champion_key is None else trusted_key(self.champion_key)
         try:
-            bundle = load_bundle(place, self.evaluation.key)
-        except BundleError as error:
-            # An older key signed it, say: it is measured as a yardstick, not trusted.
-            bundle = load_bundle(place, None)
-            log.warning("the champion, version %d, is not signed by the trusted key: %s", champion.number, error)
+            bundle = self.versions.fetch(champion, folder, trusted)
+        except ValueError as error:
+            raise ConfigurationError(
+                f"the champion, version {champion.number}, cannot be measured: {error}; `make rollback`, name its key "
+                "with champion_key=..., or delete that version"
+            ) from error
         if bundle.card.part.digest != self.evaluation.part.digest:
             log.warning("the champion, version %d, is of another form of the part and is not compared", champion.number)
-            return None
-        return bundle
+            return None, f"champion version {champion.number} is of another form of the part: not compared"
+        return bundle, ""
 
     def _evidence(self, measured: Measurement) -> Evidence:
         part = self.evaluation.part
         return Evidence(measured.figures(part), measured.resampled(part))
-
-    def _against(self) -> str:
-        champion = self.standing.champion
-        return f"against champion version {champion.number}" if champion else "no champion yet"
 
     def _instead(self) -> str:
         return f", instead of {self.standing.champion.number}" if self.standing.champion else ""

@@ -23,7 +23,6 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     """Choose, check, move; what is champion now."""
     from evaluation_job import trusted_key
 
-    from attentionvote.inference import load_bundle
     from attentionvote.registry.history import History
     from attentionvote.registry.promotion import Superseded, move, stand, target
     from attentionvote.registry.versions import Versions
@@ -37,7 +36,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
             log.warning("%s", standing.astray)
         version = target(versions, standing, cfg.to)
         with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
-            load_bundle(versions.fetch(version, Path(folder)), key)
+            versions.fetch(version, Path(folder), key)
     before = standing.champion.number if standing.champion else None
     answer = {
         "stage": "rollback",

@@ -173,6 +173,7 @@ def test_a_record_is_read_as_it_was_written(part: Part) -> None:
     parity = compare([scene(poses(0.0, 0.2), [0.9, 0.8])], [scene(poses(0.001), [0.9])], part, 0.5)
     assert parity.unmatched == 1
     assert Parity.from_dict(json.loads(json.dumps(parity.as_dict()))) == parity
+    assert Parity.from_dict(parity.as_dict() | {"translation_mm": 2e-05}).translation_mm == 2e-05
 
 
 @pytest.mark.parametrize("change", [{"ap": None}, {"pairs": "many"}, {"extra": 1}, {"unmatched_scenes": 3}])

@@ -12,7 +12,7 @@ from attentionvote.registry.history import Event, counting
 
 
 def event(number: int, base: int, kind: str = "promote", version: int = 1) -> Event:
-    return Event(number, kind, version, None, "d", base, "me@here", "why", 0.0, True)  # type: ignore[arg-type]
+    return Event(number, f"m{number}", kind, version, None, "d", base, "me@here", "why", 0.0, True)  # type: ignore[arg-type]
 
 
 def test_of_two_moves_decided_on_the_same_one_the_first_counts():

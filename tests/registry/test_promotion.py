@@ -131,3 +131,42 @@ def test_a_deleted_champion_can_be_rolled_back_and_the_story_stays(versions, his
     ]  # fmt: skip
     with pytest.raises(ValueError, match=r"got 2, which was deleted"):
         target(versions, stand(versions, history), 2)
+
+
+def test_after_a_move_back_by_hand_a_rollback_does_not_go_forward(versions, history, three):
+    for version in three:
+        promote(versions, history, version)
+    versions.set_champion(three[1])
+    assert target(versions, stand(versions, history), None).number == 1
+
+
+def test_a_slow_move_does_not_undo_a_newer_decision(versions, history, three, monkeypatch):
+    promote(versions, history, three[0])
+    standing = stand(versions, history)
+    move_alias = versions.set_champion
+
+    def slow(version):
+        """While the first request hangs, somebody carries the move out and rolls it back."""
+        monkeypatch.setattr(versions, "set_champion", move_alias)
+        promote(versions, history, three[0], "rollback")
+        move_alias(version)
+
+    monkeypatch.setattr(versions, "set_champion", slow)
+    move(versions, history, standing, "promote", three[1], "slow")
+    assert versions.champion() == three[0]
+
+
+def test_a_request_that_was_repeated_is_one_decision(versions, history, three, monkeypatch):
+    promote(versions, history, three[0])
+    create = versions.client.create_model_version
+
+    def twice(*words, **named):
+        create(*words, **named)
+        return create(*words, **named)
+
+    standing = stand(versions, history)
+    monkeypatch.setattr(versions.client, "create_model_version", twice)
+    event = move(versions, history, standing, "promote", three[1], "the answer was lost")
+    assert event.number == 2
+    assert versions.champion() == three[1]
+    assert stand(versions, history).base == 2

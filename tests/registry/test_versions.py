@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,8 +20,7 @@ def test_a_bundle_is_registered_once_and_comes_back_whole(versions, make_model, 
     again = versions.register(bundle, {"decision": "refused"})
     assert again.number == 1
     assert [v.tags["decision"] for v in versions.all()] == ["refused"]
-    place = versions.fetch(version, tmp_path / "fetched")
-    assert load_bundle(place, trusted_key).digest == bundle.digest
+    assert versions.fetch(version, tmp_path / "fetched", trusted_key).digest == bundle.digest
 
 
 def test_candidate_is_the_newest_and_champion_the_chosen(versions, make_model):
@@ -49,11 +49,11 @@ def test_artefacts_that_are_gone_are_said_and_registered_anew(versions, make_mod
         path.unlink() if path.is_file() else path.rmdir()
     model.parent.rmdir()
     with pytest.raises(ValueError, match="the artefacts of attentionvote-bracket must be in the store"):
-        versions.fetch(version, tmp_path / "fetched")
+        versions.fetch(version, tmp_path / "fetched", trusted_key)
     # The bundle is still on this machine: it becomes a version that can be fetched.
     again = versions.register(bundle, {})
     assert again.number == 2
-    assert load_bundle(versions.fetch(again, tmp_path / "fetched"), trusted_key).digest == bundle.digest
+    assert versions.fetch(again, tmp_path / "fetched", trusted_key).digest == bundle.digest
 
 
 def _is_database(versions) -> bool:
@@ -93,3 +93,18 @@ def test_a_version_belongs_to_the_run_of_its_training(versions, make_bundle, tru
         pass
     bundle = load_bundle(make_bundle("of_a_run", card={"run_id": run.id}), trusted_key)
     assert versions.register(bundle, {}).run_id == run.id
+
+
+def test_artefacts_of_another_bundle_are_not_taken_for_a_version(versions, make_model, trusted_key, tmp_path):
+    first, second = (versions.register(make_model(t), {}) for t in (0.5, 0.6))
+    with pytest.raises(ValueError, match=r"must be bundle \w{12} of bracket, but its artefacts are bundle \w{12} of"):
+        versions.fetch(replace(first, digest=second.digest), tmp_path / "fetched", trusted_key)
+
+
+def test_gates_of_an_earlier_decision_do_not_stay(versions, make_model):
+    bundle = make_model()
+    versions.register(bundle, {"decision": "refused", "gate.floor ap_10": "FAILS", "gate.latency": "holds"})
+    version = versions.register(bundle, {"decision": "passed", "gate.latency": "holds"})
+    assert "gate.floor ap_10" not in versions.of_bundle(version.digest).tags
+    versions.tag(versions.of_bundle(version.digest), {"decision": "promoted"})
+    assert versions.of_bundle(version.digest).tags["gate.latency"] == "holds"

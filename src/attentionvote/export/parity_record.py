@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 NAMES = ("ap_10", "ap_5", "ap_2")
+_COUNTS = ("scenes", "pairs", "unmatched", "worst_scene")
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ class Parity:
             values["ap"] = {str(name): (float(a), float(b)) for name, (a, b) in values["ap"].items()}
             values["unmatched_scenes"] = tuple(int(i) for i in values["unmatched_scenes"])
             for name in names - {"ap", "unmatched_scenes"}:
-                values[name] = float(values[name]) if "." in str(values[name]) else int(values[name])
-        except (TypeError, ValueError) as error:
+                values[name] = (int if name in _COUNTS else float)(values[name])
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"a record of parity must hold numbers, got something else ({error})") from error
         return cls(**values)
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import getpass
 import json
 import socket
+import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -32,6 +33,7 @@ class Event:
 
     Attributes:
         number: its place.
+        mark: drawn when it was written; a repeated request writes two entries with the same one.
         kind: ``promote``, ``refuse`` (a candidate that failed a gate) or ``rollback``.
         version: registered version that it is about.
         before: the champion's version at the time; None without one.
@@ -44,6 +46,7 @@ class Event:
     """
 
     number: int
+    mark: str
     kind: Kind
     version: int
     before: int | None
@@ -101,6 +104,7 @@ class History:
         self._create()
         named = {f"fact.{name}": value[:_TEXT_LIMIT] for name, value in (facts or {}).items()}
         content = {"version": version, "before": before, "digest": digest, "base": base, "who": who(), "why": why}
+        content["mark"] = uuid.uuid4().hex
         row = self._versions.client.create_model_version(
             self.name,
             f"attentionvote:///history/{kind}",
@@ -149,7 +153,7 @@ def _event(row: Any) -> Event:
         if kind not in get_args(Kind):
             raise ValueError(f"kind {kind!r}")
         return Event(
-            number, kind,
+            number, str(content["mark"]), kind,
             int(content["version"]), None if content["before"] is None else int(content["before"]),
             str(content["digest"]), int(content["base"]), str(content["who"]), str(content["why"]),
             row.creation_timestamp / 1000, tags.get(_DONE) == "yes",

@@ -53,7 +53,7 @@ def stand(versions: Versions, history: History, carry_out: bool = True) -> Stand
     if unfinished and carry_out:
         if moves[-1].version in existing:
             log.warning("the %s was decided but not carried out: the champion is moved now", told(moves[-1]))
-            versions.set_champion(existing[moves[-1].version])
+            _carry_out(versions, history, existing)
         history.mark_done(moves[-1])
     champion = versions.champion()
     stack: list[int] = []
@@ -65,6 +65,8 @@ def stand(versions: Versions, history: History, carry_out: bool = True) -> Stand
             stack.remove(move.version)
         stack.append(move.version)
     now = None if champion is None else champion.number
+    if now in stack:  # moved back by hand: what was above it is no way back either
+        del stack[stack.index(now) :]
     previous = tuple(number for number in stack if number in existing and number != now)
     astray = ""
     if moves and now != moves[-1].version:
@@ -98,16 +100,26 @@ def move(
     before = standing.champion.number if standing.champion else None
     event = history.append(kind, version.number, before, version.digest, standing.base, why, facts)
     moves = counting(history.events())
-    if event.number not in [other.number for other in moves]:
+    if event.mark not in [other.mark for other in moves]:
         winner = next(other for other in moves if other.base == standing.base)
         raise Superseded(
             f"the champion of {versions.part} must stay the same during a {kind}, but the {told(winner)} came first: "
             "run the same command again to decide against the new champion"
         )
-    if moves[-1].number == event.number:
-        versions.set_champion(version)
+    event = next(other for other in moves if other.mark == event.mark)
+    _carry_out(versions, history, {known.number: known for known in versions.all()})
     history.mark_done(event)
     return event
+
+
+def _carry_out(versions: Versions, history: History, existing: Mapping[int, Version]) -> None:
+    """Move the alias to where the last move wants it, and look again: a slow request must not undo a newer decision."""
+    while True:
+        last = counting(history.events())[-1]
+        if last.version in existing:
+            versions.set_champion(existing[last.version])
+        if counting(history.events())[-1].mark == last.mark:
+            return
 
 
 def target(versions: Versions, standing: Standing, wanted: int | None) -> Version:

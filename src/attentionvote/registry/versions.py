@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attentionvote.inference import Bundle, BundleError, load_bundle
+from attentionvote.inference.bundle import Trusted
 from attentionvote.registry.gates import Origin
 from attentionvote.tracking.store import connect, experiment_id, resolve_store
 
@@ -98,6 +100,9 @@ class Versions:
         """
         known = self.of_bundle(bundle.digest)
         if known is not None and self._is_whole(known):
+            for name in known.tags:
+                if name.startswith("gate.") and name not in tags:  # of an earlier decision
+                    self.client.delete_model_version_tag(self.name, str(known.number), name)
             self.tag(known, tags)
             return known
         run = self._run(bundle.card.run_id)
@@ -123,13 +128,20 @@ class Versions:
             self.client.set_registered_model_alias(self.name, CANDIDATE, row.version)
         return _version(row)
 
-    def fetch(self, version: Version, folder: Path) -> Path:
-        """Download a version's bundle into a folder and return where it lies; nothing of it is trusted yet.
+    def fetch(self, version: Version, folder: Path, trusted: Trusted) -> Bundle:
+        """Download a version's bundle into a folder and verify it: it must be what was registered.
 
         Raises:
-            ValueError: when its artefacts are gone.
+            ValueError: when its artefacts are gone, not signed by the trusted key, or another bundle's.
         """
-        return self._download(self.client.get_model_version_download_uri(self.name, str(version.number)), folder)
+        location = self.client.get_model_version_download_uri(self.name, str(version.number))
+        bundle = load_bundle(self._download(location, folder), trusted)
+        if bundle.digest != version.digest or bundle.card.part.name != self.part:
+            raise ValueError(
+                f"version {version.number} of {self.name} must be bundle {version.digest[:12]} of {self.part}, but its "
+                f"artefacts are bundle {bundle.digest[:12]} of {bundle.card.part.name}: delete that version"
+            )
+        return bundle
 
     def origin(self, run_id: str, signed_by: str) -> Origin:
         """What the store knows of the training that made a model.
@@ -173,7 +185,9 @@ class Versions:
             return None
         try:
             return self.client.get_run(run_id)
-        except MlflowException:
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise  # a store that is away or refuses says nothing about the run
             return None
 
     def _is_whole(self, version: Version) -> bool:
@@ -213,12 +227,14 @@ class Versions:
         """MLflow's SQL registry looks logged models up in the global tracking store, whatever its client says."""
         import mlflow
 
-        before = mlflow.get_tracking_uri()
+        before, variable = mlflow.get_tracking_uri(), os.environ.get("MLFLOW_TRACKING_URI")
         mlflow.set_tracking_uri(self.uri)
         try:
             yield
         finally:
             mlflow.set_tracking_uri(before)
+            if variable is None:  # it sets the variable too
+                os.environ.pop("MLFLOW_TRACKING_URI", None)
 
 
 def _version(row: ModelVersion) -> Version:
