@@ -35,7 +35,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     check_save_as(cfg.save_as, words=words)
     with configuring():
         job = SweepJob(cfg, training_words(words), _space_name(words))
-    with locked_folder(job.folder, cfg.sweeps, "sweep"):
+    with locked_folder(job.folder, cfg.sweeps, "sweep", "sweeps"):
         with configuring():
             job.open()
         return job.run()
