@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.progress import track
 
 from attentionvote.data import PartDataModule
-from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, curves, evaluate
+from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, curves, evaluate_at
 from attentionvote.evaluation.scores import THRESHOLDS
 from attentionvote.training import AttentionVoteLoss, PoseTraining
 from attentionvote.training.checkpoint import load_weights, save_trained
-from attentionvote.training.operating_point import best_threshold, confident
+from attentionvote.training.operating_point import best_threshold
 from attentionvote.training.pictures import picture_inputs
 from attentionvote.training.processes import in_order
 
@@ -48,14 +48,11 @@ def assess(
     The confidence threshold is chosen on the validation scenes.
 
     Returns:
-        ``metrics`` (see ``attentionvote.evaluation.evaluate``; precision and recall at the threshold),
+        ``metrics`` (see ``attentionvote.evaluation.evaluate_at``; precision and recall at the threshold),
         ``confidence_threshold`` and ``test_scenes``.
     """
     threshold = best_threshold(found["val"], module.part)
-    everything = evaluate(found["test"], module.part)
-    kept = evaluate(confident(found["test"], threshold), module.part)
-    # Average precision is an area over all confidences; precision and recall belong to the working point.
-    metrics = {k: v if k.startswith(("ap_", "map_", "f1_")) else kept.get(k, v) for k, v in everything.items()}
+    metrics = evaluate_at(found["test"], module.part, threshold)
     tracked.log_metrics({f"test/{k}": v for k, v in metrics.items()} | {"test/confidence_threshold": threshold}, step)
     metadata = module.metadata | {"confidence_threshold": threshold, "test": metrics}
     save_trained(module.model, metadata, model_file)
