@@ -45,7 +45,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(MAKE) --no-print-directory system
 	@echo "setup: installing the pinned dependencies into $(VENV) (once, some minutes)" >&2
 	@$(PY) -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv $(VENV) >&2
-	@$(PY) -m pip install --disable-pip-version-check --no-input -c constraints.txt -e '.[train,cluster,team,dev]' >&2 \
+	@$(PY) -m pip install --disable-pip-version-check --no-input -c constraints.txt -e '.[train,cluster,team,benchmark,dev]' >&2 \
 		|| { echo "setup: the installation failed (pip's reason is above); run the same command to try again" >&2; exit 1; }
 	@touch $@
 

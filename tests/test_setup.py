@@ -100,7 +100,7 @@ def test_setup_happens_once_and_again_when_the_pins_change(checkout: Path) -> No
     program(checkout / ".venv" / "bin", "python", 'echo "ran $*" >&2')
     first, second = (make(checkout, "setup", f"PYTHON={python}", first_on_path=checkout / "bin") for _ in range(2))
     assert "ran -m pip install" in first.stderr
-    assert "-c constraints.txt -e .[train,cluster,team,dev]" in first.stderr
+    assert "-c constraints.txt -e .[train,cluster,team,benchmark,dev]" in first.stderr
     assert "ran" not in second.stderr
     later = (checkout / ".venv" / ".setup-complete").stat().st_mtime + 10
     os.utime(checkout / "constraints.txt", (later, later))
