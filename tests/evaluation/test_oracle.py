@@ -11,7 +11,7 @@ import json
 import numpy as np
 import pytest
 
-from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, match, read_scene_results
+from attentionvote.evaluation import SceneResult, average_precision, match, read_metric, read_scene_results
 
 # threshold as a part of 10 % D: AP, F1, MAP, R99, R50, pooled AP, TP, FP, FN
 BUNNY = {
@@ -60,7 +60,7 @@ def bunny(shared_data):
 @pytest.mark.parametrize("factor", BUNNY)
 def test_bunny_sample_at_every_threshold(bunny, factor):
     path, scenes = bunny
-    metric, threshold = PoseMetric.from_poseutils(path)
+    metric, threshold = read_metric(path)
     assert threshold == 0.023435524106
     got = average_precision(scenes, metric, factor * threshold)
     figures = (got.ap, got.f1, got.map, got.r99, got.r50, got.pooled_ap)
@@ -71,7 +71,7 @@ def test_bunny_sample_at_every_threshold(bunny, factor):
 @pytest.mark.parametrize("factor", BUNNY_ALL_REQUIRED)
 def test_bunny_sample_with_all_truths_required(bunny, factor):
     path, scenes = bunny
-    metric, threshold = PoseMetric.from_poseutils(path)
+    metric, threshold = read_metric(path)
     got = average_precision(scenes, metric, factor * threshold, occlusion_limit=1.1)
     np.testing.assert_allclose((got.ap, got.f1, got.map), BUNNY_ALL_REQUIRED[factor], **SIX_DIGITS)
 
@@ -79,14 +79,14 @@ def test_bunny_sample_with_all_truths_required(bunny, factor):
 @pytest.mark.parametrize("factor", BUNNY_OBJECT_SIDE)
 def test_bunny_sample_with_the_object_side_frame(bunny, factor):
     path, scenes = bunny
-    metric, threshold = PoseMetric.from_poseutils(path, object_side=True)
+    metric, threshold = read_metric(path, "object")
     got = average_precision(scenes, metric, factor * threshold)
     np.testing.assert_allclose((got.ap, got.f1, got.map), BUNNY_OBJECT_SIDE[factor], **SIX_DIGITS)
 
 
 def test_bunny_sample_scene_by_scene(bunny):
     path, scenes = bunny
-    metric, threshold = PoseMetric.from_poseutils(path)
+    metric, threshold = read_metric(path)
     assert [int(scene.to_find().sum()) for scene in scenes] == [17, 14, 18, 17, 16, 13, 16, 17, 18, 13, 17]
     assert (sum(len(s.gt_poses) for s in scenes), sum(len(s.poses) for s in scenes)) == (825, 147)
     got = average_precision(scenes, metric, threshold)
@@ -99,7 +99,7 @@ def test_bunny_sample_scene_by_scene(bunny):
 @pytest.fixture(scope="module", params=CLASSES)
 def oracle(request, shared_data):
     folder = shared_data(f"bregier_oracle/{request.param}")
-    metric, threshold = PoseMetric.from_poseutils(folder / "poseutils.json")
+    metric, threshold = read_metric(folder / "poseutils.json")
     scenes = read_scene_results(folder / "gt", folder / "results")
     return request.param, metric, threshold, scenes, json.loads((folder / "expected.json").read_text())
 

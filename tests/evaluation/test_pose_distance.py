@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from attentionvote.evaluation import PoseMetric, rotation_errors
-from attentionvote.geometry.pose import inverse, rotation_about, transform
+from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import surface_moments
 
@@ -137,51 +135,3 @@ def test_rotation_errors_respect_the_symmetry():
 def test_metric_refuses_a_wrong_covariance():
     with pytest.raises(ValueError, match=r"covariance_root must be \(3, 3\) finite numbers, got shape \(3,\)"):
         PoseMetric(Symmetry(), np.ones(3))
-
-
-def affine() -> dict:
-    return {"type": "AffinePoseUtils", "Lambda": np.diag([1.0, 2, 3]).tolist(), "G": [np.eye(3).tolist()],
-            "distance_threshold": 0.02}  # fmt: skip
-
-
-def test_from_poseutils_reads_both_types(tmp_path):
-    path = tmp_path / "poseutils.json"
-    turns = Symmetry("cyclic", order=3).rotations()
-    path.write_text(json.dumps(affine() | {"G": turns.tolist(), "Lambda": np.diag([1.0, 1, 3]).tolist()}))
-    metric, threshold = PoseMetric.from_poseutils(path)
-    assert threshold == 0.02
-    np.testing.assert_allclose(metric.symmetry.rotations(), turns, atol=1e-12)
-    path.write_text(json.dumps({"type": "RevolutionPoseUtils", "lambda": 0.3, "rotoreflection_symmetry": True,
-                                "distance_threshold": 0.015}))  # fmt: skip
-    metric, threshold = PoseMetric.from_poseutils(path)
-    assert (threshold, metric.symmetry) == (0.015, Symmetry("revolution", flip=True))
-    assert metric.revolution_radius == pytest.approx(0.3, rel=1e-14)
-
-
-def test_from_poseutils_object_side_moves_the_reference(tmp_path, make_poses):
-    rng = np.random.default_rng(4)
-    reference_from_part = make_poses(rng, 1)[0]
-    frame = {"Rref2i": reference_from_part[:3, :3].tolist(), "tref2i": reference_from_part[:3, 3:].tolist()}
-    path = tmp_path / "poseutils.json"
-    path.write_text(json.dumps(affine() | frame))
-    a, b = make_poses(rng, 3), make_poses(rng, 3)
-    plain = PoseMetric.from_poseutils(path)[0]
-    moved = PoseMetric.from_poseutils(path, object_side=True)[0]
-    back = inverse(reference_from_part)
-    np.testing.assert_allclose(moved.distances(a, b), plain.distances(a @ back, b @ back), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"type": "Cube"}, "type must be AffinePoseUtils or RevolutionPoseUtils, got 'Cube'"),
-        ({"Lambda": [1, 2, 3]}, r"Lambda must be 3 x 3 finite numbers, got \[1, 2, 3\]"),
-        ({"G": []}, r"G must be n x 3 x 3 finite numbers, got \[\]"),
-        ({"distance_threshold": "wide"}, "distance_threshold must be one number, got 'wide'"),
-    ],
-)
-def test_from_poseutils_names_what_is_wrong(tmp_path, change, text):
-    path = tmp_path / "poseutils.json"
-    path.write_text(json.dumps(affine() | change))
-    with pytest.raises(ValueError, match=text):
-        PoseMetric.from_poseutils(path)

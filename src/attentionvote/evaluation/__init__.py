@@ -7,6 +7,7 @@ from attentionvote.evaluation.average_distance import AverageDistance, NearestPo
 from attentionvote.evaluation.average_precision import DetectionScores, average_precision
 from attentionvote.evaluation.bootstrap import Interval, interval, resampled_figures, scene_weights
 from attentionvote.evaluation.matching import Matching, ScoreCurve, match, score_curve
+from attentionvote.evaluation.metric_file import read_metric
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
 from attentionvote.evaluation.result_files import (
     read_ground_truth,
@@ -36,6 +37,7 @@ __all__ = [
     "interval",
     "match",
     "read_ground_truth",
+    "read_metric",
     "read_results",
     "read_scene_results",
     "resampled_figures",

@@ -8,15 +8,13 @@ displacement of the surface, minimised over the symmetries of the part.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 
-from attentionvote.evaluation.result_files import read_json
 from attentionvote.evaluation.scene_result import Array
-from attentionvote.geometry.pose import inverse, quaternion_from_matrix, transform
+from attentionvote.geometry.pose import transform
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part, surface_moments
 
@@ -63,38 +61,6 @@ class PoseMetric:
         centroid = surface_moments(part.vertices, part.faces)[1]
         return cls(part.symmetry, part.covariance_root, transform(np.eye(3), centroid))
 
-    @classmethod
-    def from_poseutils(cls, path: str | Path, object_side: bool = False) -> tuple[PoseMetric, float]:
-        """The metric and the distance threshold (metres) in a Sileane ``poseutils.json``.
-
-        The toolbox multiplies ``Rref2i``, ``tref2i`` from the left, where they cancel, so they are left
-        out; ``object_side`` applies them to the part, as the paper means it (other figures below 2 % D).
-
-        Raises:
-            ValueError: with one sentence, when the file does not describe a metric.
-        """
-        content = read_json(path)
-        kind = content.get("type") if isinstance(content, dict) else None
-        if kind == "AffinePoseUtils":
-            root = _matrix(path, content, "Lambda", (3, 3))
-            rotations = _matrix(path, content, "G", (-1, 3, 3))
-            if len(rotations) == 1 and np.allclose(rotations[0], np.eye(3), atol=1e-9):
-                symmetry = Symmetry()
-            else:
-                symmetry = Symmetry("group", quaternions=quaternion_from_matrix(rotations).tolist())
-        elif kind == "RevolutionPoseUtils":
-            # The file gives lambda alone; any root with lambda_r^2 + lambda_z^2 = lambda^2 is the same metric.
-            root = np.eye(3) * float(_matrix(path, content, "lambda", ())) / np.sqrt(2.0)
-            symmetry = Symmetry("revolution", flip=bool(content.get("rotoreflection_symmetry", False)))
-        else:
-            raise ValueError(f"{path}: type must be AffinePoseUtils or RevolutionPoseUtils, got {kind!r}")
-        frame = np.eye(4)
-        if object_side:
-            rotation, translation = (_matrix(path, content, k, s) for k, s in (("Rref2i", (3, 3)), ("tref2i", (3, 1))))
-            frame = inverse(transform(rotation, translation[:, 0]))
-        threshold = float(_matrix(path, content, "distance_threshold", ()))
-        return cls(symmetry, root, frame), threshold
-
     @property
     def revolution_radius(self) -> float:
         """``lambda`` in metres of a body of revolution: ``sqrt(lambda_r^2 + lambda_z^2)``."""
@@ -136,15 +102,3 @@ def rotation_errors(a: ArrayLike, b: ArrayLike, symmetry: Symmetry) -> Array:
     """
     r_a, r_b = (np.asarray(p, dtype=np.float64).reshape(-1, 4, 4)[:, :3, :3] for p in (a, b))
     return symmetry.angle(r_a, r_b)
-
-
-def _matrix(path: str | Path, content: dict, key: str, shape: tuple[int, ...]) -> Array:
-    try:
-        value = np.asarray(content[key], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
-        value = np.full(1, np.nan)
-    fits = value.ndim == len(shape) and all(n in (-1, m) and m > 0 for n, m in zip(shape, value.shape, strict=True))
-    if not fits or not np.isfinite(value).all():
-        wanted = "one number" if not shape else " x ".join("n" if n < 0 else str(n) for n in shape) + " finite numbers"
-        raise ValueError(f"{path}: {key} must be {wanted}, got {content.get(key)!r}")
-    return value

@@ -69,7 +69,8 @@ def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -
     """Every scene that has a result file, by name (sorted).
 
     Raises:
-        ValueError: with one sentence, when there is no result file, or one without ground truth.
+        ValueError: with one sentence, when there is no result file, or one without ground truth, or the results are
+            in another unit.
     """
     gt_directory, result_directory = Path(gt_directory), Path(result_directory)
     for directory in (gt_directory, result_directory):
@@ -90,7 +91,47 @@ def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -
         poses, scores = read_results(path)
         gt_poses, occlusion = read_ground_truth(gt_directory / path.name)
         scenes[path.stem] = SceneResult(poses, scores, gt_poses, occlusion)
+    found, true = (
+        np.concatenate([getattr(s, name)[:, :3, 3] for s in scenes.values()]) for name in ("poses", "gt_poses")
+    )
+    if problem := unit_problem(found, true, "metres", "millimetres"):
+        raise ValueError(f"{result_directory}: {problem}")
     return scenes
+
+
+def rotation_problem(rotations: Array) -> tuple[int, str] | None:
+    """Index of the first of ``(N, 3, 3)`` that is no rotation and the end of a sentence about it, or None."""
+    deviation = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max((-2, -1), initial=0.0)
+    determinant = np.linalg.det(rotations)
+    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (determinant < 0))
+    if not len(wrong):
+        return None
+    i = int(wrong[0])
+    return i, (
+        f"must be a rotation (R R^T = I within {ROTATION_TOLERANCE}, determinant +1), "
+        f"got a deviation of {deviation[i]:.3g} and determinant {determinant[i]:.3g}"
+    )
+
+
+def unit_problem(translations: Array, gt_translations: Array, unit: str, other: str) -> str:
+    """The end of a sentence when results ``(R, 3)`` and ground truth ``(I, 3)`` are surely in different units.
+
+    Distances from the origin of the common frame are compared: medians that differ by more than a factor of 100 are
+    a thousandfold one (m and mm), not poses. Empty when they agree or nothing can be said.
+
+    Args:
+        translations, gt_translations: in the unit that the files should have.
+        unit, other: names of that unit and of the one that is taken for it.
+    """
+    if not len(translations) or not len(gt_translations):
+        return ""
+    found, true = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (translations, gt_translations))
+    if min(found, true) <= 0 or 0.01 <= found / true <= 100:
+        return ""
+    return (
+        f"t must be in {unit}, as the ground truth is, got a median distance of {found:.4g} from the origin "
+        f"where the ground truth has {true:.4g}; it looks like {other}"
+    )
 
 
 def _read(path: str | Path, value_key: str) -> tuple[Array, Array]:
@@ -108,14 +149,8 @@ def _read(path: str | Path, value_key: str) -> tuple[Array, Array]:
         rotations[i] = _entry(path, i, entry, "R", (3, 3))
         translations[i] = _entry(path, i, entry, "t", (3,))
         values[i] = _entry(path, i, entry, value_key, ())
-    deviation = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max((-2, -1), initial=0.0)
-    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) < 0))
-    if len(wrong):
-        i = int(wrong[0])
-        raise ValueError(
-            f"{path}: R of entry {i} must be a rotation (R R^T = I within {ROTATION_TOLERANCE}, determinant +1), "
-            f"got a deviation of {deviation[i]:.3g} and determinant {np.linalg.det(rotations[i]):.3g}"
-        )
+    if problem := rotation_problem(rotations):
+        raise ValueError(f"{path}: R of entry {problem[0]} {problem[1]}")
     return transform(rotations, translations), values
 
 
