@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from attentionvote.model import AttentionVote, Peaks, find_neighborhoods
+from attentionvote.model.proposals import gather_votes
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
@@ -146,6 +147,33 @@ def test_voting_radius_may_be_set_during_training(make_network: Callable) -> Non
     assert make_network(base_radius=0.01).layout.radii == pytest.approx((0.01, 0.02, 0.03, 0.06))
 
 
+def test_outside_training_votes_come_from_the_test_radius(make_network: Callable, make_cloud: Callable) -> None:
+    """Offsets keep the training's unit: a test radius that gathers the same votes changes nothing."""
+    points, normals = make_cloud(5, 1, 96)
+    trained, wide = (make_network(2, voting_radius=r) for r in (0.03, 0.05))
+    same = make_network(2, voting_radius=0.03, test_voting_radius=0.03)
+    tested = make_network(2, voting_radius=0.03, test_voting_radius=0.05)
+    with torch.no_grad():
+        votes = trained.cast_votes(points, normals, batch_of(points, trained))
+        peaks = trained.find_peaks(votes)
+        plain = trained.regress(votes, peaks).feature
+        assert torch.equal(same.regress(votes, peaks).feature, plain)
+        # Gathered in the test radius, divided by the training's.
+        index = gather_votes(votes.xyz, peaks.center_seed, 0.05, tested.gathered)[0]
+        offsets = (votes.xyz[0][index] - peaks.center_seed[0][:, None]) / 0.03
+        expected = tested.head(tested.fusion(offsets, votes.feature[0], index))
+        actual = tested.regress(votes, peaks).feature
+        torch.testing.assert_close(actual, expected)
+        assert not torch.allclose(actual, plain, atol=1e-3)
+        assert not torch.allclose(actual, wide.regress(votes, peaks).feature, atol=1e-3)
+        # In training the test radius is not looked at.
+        for model in (trained, tested):
+            model.fusion.train()
+            model.head.train()
+        tested.training = True
+        torch.testing.assert_close(tested.regress(votes, peaks).feature, trained.regress(votes, peaks).feature)
+
+
 def test_confidence_is_clamped_or_a_probability(make_network: Callable) -> None:
     scores = torch.tensor([-100.0, 0.0, 100.0])
     exponential = make_network(confidence="exponential").confidence_of(scores)
@@ -159,6 +187,8 @@ def test_confidence_is_clamped_or_a_probability(make_network: Callable) -> None:
         ({"rotation": "euler"}, "rotation must be quaternion or six, got 'euler'"),
         ({"confidence": "softmax"}, "confidence must be exponential or quality, got 'softmax'"),
         ({"center_seed": "median"}, "center_seed must be voxel or mean, got 'median'"),
+        ({"proposal_source": "nms"}, "proposal_source must be heatmap or fps, got 'nms'"),
+        ({"fusion_kind": "max"}, "fusion_kind must be aml or amx or pn, got 'max'"),
         ({"centers": [48, 24, 12]}, "a layout must have four levels of centers, neighbors and radii, got 3, 4 and 4"),
     ],
 )

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.model.backbone import Backbone
-from attentionvote.model.fusion import AttentionVoting
+from attentionvote.model.farthest_votes import FarthestVotes, farthest_vote_peaks
+from attentionvote.model.fusion import FUSIONS, FusionKind
 from attentionvote.model.layers import shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
 from attentionvote.model.precision import widened
+from attentionvote.model.predictions import Poses, Predictions, Votes
 from attentionvote.model.proposals import Peaks, gather_votes, heatmap_peaks
 from attentionvote.model.refinement import Refined, Refiner
 from attentionvote.model.rotation import (
@@ -22,64 +24,6 @@ from attentionvote.model.rotation import (
     quaternion_from_matrix,
     unit_quaternion,
 )
-
-
-class Votes(NamedTuple):
-    """One vote a seed: where the centre of its instance is (section 3.1).
-
-    Attributes:
-        seed_index: ``(batch, M)`` index of the seed among the sample's points.
-        xyz: ``(batch, M, 3)`` voted centre, metres.
-        feature: ``(batch, M, F)``.
-        rotation: ``(batch, M, 3, 3)`` rotation voted by the auxiliary head, None without one.
-    """
-
-    seed_index: Tensor
-    xyz: Tensor
-    feature: Tensor
-    rotation: Tensor | None
-
-
-class Poses(NamedTuple):
-    """Poses of proposals, one row each.
-
-    Attributes:
-        center: ``(rows, 3)`` metres, the part's origin in the camera frame.
-        rotation: ``(rows, 3, 3)`` ``camera_from_part``.
-        quaternion: ``(rows, 4)`` unit quaternion with the sign the network gave it (Eq. 6 needs it).
-        class_logits: ``(rows, classes)``.
-        score: ``(rows,)`` logarithm of the confidence c (Eq. 10), or the logit of the expected quality.
-        feature: ``(rows, width)``.
-    """
-
-    center: Tensor
-    rotation: Tensor
-    quaternion: Tensor
-    class_logits: Tensor
-    score: Tensor
-    feature: Tensor
-
-
-class Predictions(NamedTuple):
-    """What the network answers; field names are the names of the exported graph's outputs.
-
-    Attributes:
-        vote_xyz: ``(batch, M, 3)`` voted centres.
-        center_seed: ``(batch, K, 3)`` heatmap peaks, hottest first.
-        peak_heat: ``(batch, K)`` heat; 0 where there are fewer than K peaks.
-        center: ``(batch, K, 3)`` metres.
-        quaternion: ``(batch, K, 4)`` unit, w first.
-        class_logits: ``(batch, K, classes)``.
-        confidence: ``(batch, K)``, higher is better; 0 for a proposal that was merged into another.
-    """
-
-    vote_xyz: Tensor
-    center_seed: Tensor
-    peak_heat: Tensor
-    center: Tensor
-    quaternion: Tensor
-    class_logits: Tensor
-    confidence: Tensor
 
 
 class AttentionVote(nn.Module):
@@ -92,12 +36,15 @@ class AttentionVote(nn.Module):
         base_radius: r in metres; None takes ``radius_fraction`` x D. Levels have r, 2r, 3r and 6r.
         voxel_size: of the heatmap in metres; None takes ``voxel_fraction`` x D.
         voting_radius: radius in which votes are gathered, metres; None takes r. May be set during training.
+        test_voting_radius: the same outside training (Table 9); None takes ``voting_radius``.
         voting: hidden widths of the voting module.
         vote_rotation: whether every vote also predicts its instance's rotation: dense supervision, not in the paper.
+        proposal_source: ``heatmap`` (section 3.2) or ``fps``, VoteNet's farthest-point sampling of the votes.
         proposals: K.
         peak_window, center_seed: see ``heatmap_peaks``.
         gathered: H, votes gathered for a proposal.
-        fusion: widths of both branches of the attention (section 3.5: 128, 128, 128).
+        fusion_kind: ``aml``, ``amx`` or ``pn`` (Table 8), see ``model.fusion``.
+        fusion: widths of the fusion's MLPs (section 3.5: 128, 128, 128).
         head: hidden widths of the head.
         classes: NC.
         rotation: ``quaternion`` (the paper's) or ``six`` (Gram-Schmidt of two vectors).
@@ -109,7 +56,7 @@ class AttentionVote(nn.Module):
             get 0; None leaves it to the peaks alone, as in the paper.
 
     Raises:
-        ValueError: on an unknown ``center_seed``, ``rotation`` or ``confidence``, or an impossible layout.
+        ValueError: on an unknown choice, or an impossible layout.
     """
 
     def __init__(
@@ -131,9 +78,12 @@ class AttentionVote(nn.Module):
         base_radius: float | None = None,
         voxel_size: float | None = None,
         voting_radius: float | None = None,
+        test_voting_radius: float | None = None,
         vote_rotation: bool = False,
+        proposal_source: Literal["heatmap", "fps"] = "heatmap",
         peak_window: int = 1,
         center_seed: Literal["voxel", "mean"] = "voxel",
+        fusion_kind: FusionKind = "aml",
         classes: int = 1,
         rotation: Literal["quaternion", "six"] = "quaternion",
         confidence: Literal["exponential", "quality"] = "exponential",
@@ -143,6 +93,8 @@ class AttentionVote(nn.Module):
     ) -> None:
         super().__init__()
         for name, value, choices in (
+            ("proposal_source", proposal_source, ("heatmap", "fps")),
+            ("fusion_kind", fusion_kind, tuple(FUSIONS)),
             ("center_seed", center_seed, ("voxel", "mean")),
             ("rotation", rotation, ("quaternion", "six")),
             ("confidence", confidence, ("exponential", "quality")),
@@ -153,6 +105,7 @@ class AttentionVote(nn.Module):
         radius = base_radius or radius_fraction * diameter
         self.voxel_size = voxel_size or voxel_fraction * diameter
         self.voting_radius = voting_radius or radius
+        self.test_voting_radius = test_voting_radius
         self.layout = Layout(tuple(centers), tuple(neighbors), tuple(radius * k for k in (1, 2, 3, 6)))
         self.proposals, self.gathered, self.classes = proposals, gathered, classes
         self.peak_window, self.center_seed = peak_window, center_seed
@@ -164,7 +117,9 @@ class AttentionVote(nn.Module):
         self.vote = shared_mlp(width, voting, 3 + width)
         rotation_size = 4 if rotation == "quaternion" else 6
         self.vote_rotation = nn.Linear(width, rotation_size) if vote_rotation else None
-        self.fusion = AttentionVoting(width, fusion)
+        # A module without weights: the exporter puts its own in its place.
+        self.farthest = FarthestVotes() if proposal_source == "fps" else None
+        self.fusion = FUSIONS[fusion_kind](width, fusion)
         self.head = shared_mlp(self.fusion.width, head)
         self.output = nn.Linear(head[-1], 3 + rotation_size + classes + 1)
         last = self.vote[-1]
@@ -191,17 +146,24 @@ class AttentionVote(nn.Module):
         return Votes(found.order[:, : self.layout.seeds], xyz, feature, rotation)
 
     def find_peaks(self, votes: Votes) -> Peaks:
-        """The K hottest peaks of the votes' heatmap (section 3.2); positions carry no gradient to the votes."""
-        return heatmap_peaks(votes.xyz.detach(), self.voxel_size, self.proposals, self.peak_window, self.center_seed)
+        """The K hottest peaks of the votes' heatmap or K farthest votes (section 3.2), without gradient to them."""
+        xyz = votes.xyz.detach()
+        if self.farthest is not None:
+            return farthest_vote_peaks(xyz, self.farthest(xyz, min(self.proposals, xyz.shape[1])))
+        return heatmap_peaks(xyz, self.voxel_size, self.proposals, self.peak_window, self.center_seed)
 
     def regress(self, votes: Votes, peaks: Peaks, rows: Int[Tensor, " rows"] | None = None) -> Poses:
         """Poses of proposals from the votes around them (sections 3.3, 3.4).
+
+        Outside training the votes come from the test radius, but offsets stay in units of the training's: an offset of
+        some millimetres means to the network what it meant then.
 
         Args:
             rows: flat indices into ``(batch, K)`` of the proposals wanted; all when None.
         """
         batch, _, _ = peaks.center_seed.shape
-        index = gather_votes(votes.xyz.detach(), peaks.center_seed, self.voting_radius, self.gathered)
+        radius = self.voting_radius if self.training else self.test_voting_radius or self.voting_radius
+        index = gather_votes(votes.xyz.detach(), peaks.center_seed, radius, self.gathered)
         first_row = torch.arange(batch, device=index.device)[:, None, None] * votes.xyz.shape[1]
         index = (index + first_row).flatten(0, 1)
         seed = peaks.center_seed.flatten(0, 1)
