@@ -1,0 +1,73 @@
+"""Which format a folder is, by its files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from attentionvote.datasets.dataset import Dataset
+from attentionvote.datasets.ipa import IpaDataset
+
+# How far below the given folder a dataset is looked for: root, split, object.
+LEVELS = 4
+LOOKS = {
+    "IPA": "<split>/<Object>/ with parameter.json and gt/cycle_*/ or p_depth/cycle_*/",
+}
+
+
+def open_datasets(directory: Path) -> list[Dataset]:
+    """Every dataset in a folder, which may be a dataset's own, or hold several splits, objects or formats.
+
+    Raises:
+        ValueError: with one sentence, when the folder does not exist or holds none of the formats.
+    """
+    if not directory.is_dir():
+        raise ValueError(f"{directory}: the folder of a dataset must exist, got {_what(directory)}")
+    found: dict[tuple[Callable[[list[Path]], list[Dataset]], Path, str], list[Path]] = {}
+    for folder, opener, group in _folders(directory, LEVELS):
+        found.setdefault((opener, folder.parent, group), []).append(folder)
+    datasets = [dataset for (opener, _, _), folders in found.items() for dataset in opener(folders)]
+    if not datasets:
+        looks = "; ".join(f"{name}: {look}" for name, look in LOOKS.items())
+        raise ValueError(f"{directory} must hold a dataset of a known layout, got none of them ({looks})")
+    return datasets
+
+
+def split_of(folder: Path) -> str:
+    """``train``, ``test``, ``val`` or ``real`` by a folder's name, else the name itself."""
+    name = folder.resolve().name
+    for word in ("train", "test", "val", "real"):
+        if word in name.lower():
+            return word
+    return name
+
+
+def _what(directory: Path) -> str:
+    return "a file" if directory.exists() else "nothing there"
+
+
+Recognised = tuple[Path, Callable[[list[Path]], list[Dataset]], str]
+
+
+def _folders(folder: Path, levels: int) -> Iterator[Recognised]:
+    """Folders of datasets at or below ``folder``, each with what opens it and the group it is opened with."""
+    if _is_ipa(folder):
+        yield folder, _open_ipa, re.sub(r"_part_\d+$", "", folder.resolve().name)
+    elif levels > 1:
+        for child in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
+            yield from _folders(child, levels - 1)
+
+
+def _is_ipa(folder: Path) -> bool:
+    return any(any((folder / name).glob("cycle_*")) for name in ("gt", "p_depth", "p_depth_real_world"))
+
+
+def _open_ipa(folders: list[Path]) -> list[Dataset]:
+    split = split_of(folders[0].resolve().parent)
+    datasets: list[Dataset] = []
+    for place, real in (("p_depth", False), ("p_depth_real_world", True)):
+        having = [folder for folder in folders if (folder / place).is_dir()]
+        if having or (not real and not any((folder / "p_depth_real_world").is_dir() for folder in folders)):
+            datasets.append(IpaDataset(having or folders, real, split))
+    return datasets
