@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
@@ -18,27 +18,39 @@ from attentionvote.training.checkpoint import load_weights, save_trained
 from attentionvote.training.operating_point import best_threshold
 from attentionvote.training.pictures import picture_inputs
 from attentionvote.training.processes import in_order
+from attentionvote.training.proposal_counts import ProposalCounts, proposal_figures
 
 log = logging.getLogger("attentionvote.train")
 _LEAST_HISTORY = 10  # logged steps from which on it can be said whether a loss fell
 
 
+class Found(NamedTuple):
+    """What was found in the scenes of a split, and how the proposals cover them; scene by scene."""
+
+    results: list[SceneResult]
+    proposals: list[ProposalCounts]
+
+
 def detect_everything(
     module: PoseTraining, data: PartDataModule, weights: Path, device: torch.device
-) -> dict[str, list[SceneResult]]:
+) -> dict[str, Found]:
     """What the weights of a checkpoint find in all validation and test scenes, by split.
 
     Every process looks at its share; the first one gets all, in the order of the scenes, the others get empty lists.
     """
     load_weights(module, weights)
     module.eval().to(device)
-    return {name: in_order(_detect(module, data, name, device)) for name in ("val", "test")}
+    found = {}
+    for name in ("val", "test"):
+        pairs = in_order(_detect(module, data, name, device))
+        found[name] = Found([result for result, _ in pairs], [counts for _, counts in pairs])
+    return found
 
 
 def assess(
     module: PoseTraining,
     data: PartDataModule,
-    found: dict[str, list[SceneResult]],
+    found: dict[str, Found],
     model_file: Path,
     tracked: Any,
     step: int,
@@ -48,27 +60,30 @@ def assess(
     The confidence threshold is chosen on the validation scenes.
 
     Returns:
-        ``metrics`` (see ``attentionvote.evaluation.evaluate_at``; precision and recall at the threshold),
-        ``confidence_threshold`` and ``test_scenes``.
+        ``metrics`` (see ``attentionvote.evaluation.evaluate_at``; precision and recall at the threshold; and
+        ``training.proposal_counts.proposal_figures``), ``confidence_threshold`` and ``test_scenes``.
     """
-    threshold = best_threshold(found["val"], module.part)
-    metrics = evaluate_at(found["test"], module.part, threshold)
+    results = found["test"].results
+    threshold = best_threshold(found["val"].results, module.part)
+    metrics = evaluate_at(results, module.part, threshold) | proposal_figures(found["test"].proposals)
     tracked.log_metrics({f"test/{k}": v for k, v in metrics.items()} | {"test/confidence_threshold": threshold}, step)
     metadata = module.metadata | {"confidence_threshold": threshold, "test": metrics}
     save_trained(module.model, metadata, model_file)
     tracked.log_file("checkpoints/model.ckpt", model_file)
-    _draw(module, data, found["test"], threshold, tracked)
+    _draw(module, data, results, threshold, tracked)
     return {
         "confidence_threshold": threshold,
-        "test_scenes": len(found["test"]),
+        "test_scenes": len(results),
         "metrics": {k: round(v, 4) for k, v in metrics.items()},
     }
 
 
-def _detect(module: PoseTraining, data: PartDataModule, split: str, device: torch.device) -> list[SceneResult]:
+def _detect(
+    module: PoseTraining, data: PartDataModule, split: str, device: torch.device
+) -> list[tuple[SceneResult, ProposalCounts]]:
     loader = data.val_dataloader() if split == "val" else data.test_dataloader()
     batches = track(loader, f"{module.part.name}: detecting, {split}", console=Console(stderr=True))
-    return [result for batch in batches for result in module.detect(batch.to(device))]
+    return [pair for batch in batches for pair in module.examine(batch.to(device))]
 
 
 def _draw(

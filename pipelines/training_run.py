@@ -22,11 +22,10 @@ from training_data import prepare_data
 from training_job import MODEL, RESULT, RUN, TrainingJob
 from training_messages import plain_loader_errors, quiet_lightning
 from training_processes import FirstDoes, Place
-from training_results import assess, detect_everything, log_losses
+from training_results import Found, assess, detect_everything, log_losses
 
 from attentionvote import __version__
 from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule
-from attentionvote.evaluation import SceneResult
 from attentionvote.model import AttentionVote
 from attentionvote.simulation import Sensor
 from attentionvote.tracking.provenance import git_state
@@ -281,7 +280,7 @@ class TrainingRun:
         self.checkpoint_files.before_save = tracked.flush_metrics
         self.trainer.loggers = [RunLogger(tracked)]
 
-    def _detect(self, data: PartDataModule) -> tuple[Path, dict[str, list[SceneResult]]]:
+    def _detect(self, data: PartDataModule) -> tuple[Path, dict[str, Found]]:
         """The checkpoint that the training ends with, and what it finds (in the first process, of all)."""
         files = [self._checkpoints / "best.ckpt", self._checkpoints / "last.ckpt"]
         weights = Path(self.first_does("weights", lambda: str(next(path for path in files if path.is_file()))))

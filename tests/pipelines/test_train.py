@@ -194,6 +194,7 @@ def test_the_whole_chain(
     assert {"stage", "object", "run_id", "model", "checkpoint", "metrics", "losses", "steps", "seconds"} <= set(result)
     assert (result["object"], result["steps"], result["test_scenes"]) == ("brick", 12, 2)
     assert {"ap_10", "ap_5", "ap_2", "precision_10", "recall_10", "add_recall_10"} <= set(result["metrics"])
+    assert {"proposal_recall", "proposal_repeats", "proposal_strays", "proposal_count"} <= set(result["metrics"])
     first, last = result["losses"]["vote"]
     assert last < first
     model, metadata = load_trained(result["model"])

@@ -17,6 +17,7 @@ from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY
 from attentionvote.training.detections import scene_results
 from attentionvote.training.losses import AttentionVoteLoss, batch_loss
+from attentionvote.training.proposal_counts import ProposalCounts, proposal_counts
 from attentionvote.training.schedule import Schedule
 
 
@@ -84,11 +85,21 @@ class PoseTraining(L.LightningModule):
         self.log("val/ap", (metrics["ap_10"] + metrics["ap_5"] + metrics["ap_2"]) / 3)
 
     @torch.no_grad()
-    def detect(self, batch: Batch) -> list[SceneResult]:
-        """Detections of a batch beside its truth; inference looks at votes within the test radius."""
+    def predict(self, batch: Batch) -> Predictions:
+        """What the network answers; never with the larger radius of the warm-up."""
         self.model.voting_radius = self.voting_radius
         predictions: Predictions = self.model(batch.points, batch.normals, batch.found)
-        return scene_results(predictions, batch, self.peak_threshold)
+        return predictions
+
+    def detect(self, batch: Batch) -> list[SceneResult]:
+        """Detections of a batch beside its truth."""
+        return scene_results(self.predict(batch), batch, self.peak_threshold)
+
+    def examine(self, batch: Batch) -> list[tuple[SceneResult, ProposalCounts]]:
+        """``detect``, and how the proposals cover the instances within the radius of the loss's assignment."""
+        predictions, radius = self.predict(batch), self.loss.settings.assignment * self.part.diameter
+        counts = proposal_counts(predictions, batch, self.peak_threshold, radius)
+        return list(zip(scene_results(predictions, batch, self.peak_threshold), counts, strict=True))
 
     def configure_optimizers(self) -> Any:
         """Adam or AdamW (no decay on biases and norms) with the schedule's rate, changed every step."""
