@@ -8,11 +8,13 @@ from pathlib import Path
 
 from attentionvote.datasets.dataset import Dataset
 from attentionvote.datasets.ipa import IpaDataset
+from attentionvote.datasets.sileane import CAMERA_FILE, DEPTH_FOLDERS, SileaneDataset
 
 # How far below the given folder a dataset is looked for: root, split, object.
 LEVELS = 4
 LOOKS = {
     "IPA": "<split>/<Object>/ with parameter.json and gt/cycle_*/ or p_depth/cycle_*/",
+    "Sileane": "<object>/ with camera_params.txt and gt/*.json or depth/*.PNG",
 }
 
 
@@ -54,6 +56,8 @@ def _folders(folder: Path, levels: int) -> Iterator[Recognised]:
     """Folders of datasets at or below ``folder``, each with what opens it and the group it is opened with."""
     if _is_ipa(folder):
         yield folder, _open_ipa, re.sub(r"_part_\d+$", "", folder.resolve().name)
+    elif _is_sileane(folder):
+        yield folder, _open_sileane, folder.name
     elif levels > 1:
         for child in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
             yield from _folders(child, levels - 1)
@@ -61,6 +65,15 @@ def _folders(folder: Path, levels: int) -> Iterator[Recognised]:
 
 def _is_ipa(folder: Path) -> bool:
     return any(any((folder / name).glob("cycle_*")) for name in ("gt", "p_depth", "p_depth_real_world"))
+
+
+def _is_sileane(folder: Path) -> bool:
+    places = [folder / name for name in ("gt", *DEPTH_FOLDERS)]
+    return (folder / CAMERA_FILE).is_file() and any(place.is_dir() for place in places)
+
+
+def _open_sileane(folders: list[Path]) -> list[Dataset]:
+    return [SileaneDataset(folder) for folder in folders]
 
 
 def _open_ipa(folders: list[Path]) -> list[Dataset]:
