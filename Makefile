@@ -45,8 +45,11 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(MAKE) --no-print-directory system
 	@echo "setup: installing the pinned dependencies into $(VENV) (once, some minutes)" >&2
 	@$(PY) -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv $(VENV) >&2
-	@$(PY) -m pip install --disable-pip-version-check --no-input -c constraints.txt -e '.[train,cluster,team,benchmark,dev]' >&2 \
+	@$(PY) -m pip install --disable-pip-version-check --no-input --no-compile -c constraints.txt \
+		-e '.[train,cluster,team,benchmark,dev]' >&2 \
 		|| { echo "setup: the installation failed (pip's reason is above); run the same command to try again" >&2; exit 1; }
+	@# pip would compile on one core, the packages' own tests too; what fails here is compiled when it is imported.
+	@$(PY) -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib >&2 || true
 	@touch $@
 
 # The wheels bring their own libraries (checked with ldd): what the system must have is a Python 3.11 with
