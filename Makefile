@@ -34,7 +34,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train sweep fleet smoke export evaluate promote rollback history serve keys bench-serve image generate view part ui test test-fast lint format clean
+.PHONY: help setup system train sweep fleet smoke export evaluate promote rollback history score serve keys bench-serve image generate view part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -98,6 +98,9 @@ rollback: $(STAMP) ## Bring the champion before back, or a former one: OBJECT=co
 
 history: $(STAMP) ## Show who moved the champion, when, from where to where, and why: OBJECT=connecting_rod
 	@$(PY) pipelines/history.py $(object) $(ARGS)
+
+score: $(STAMP) ## Score any method's result files, Sileane's or BOP's: ARGS="gt=DIR results=DIR poseutils=FILE"
+	@$(PY) pipelines/score.py $(ARGS)
 
 serve: $(STAMP) ## Serve the newest bundle on this machine, as a cell does: OBJECT=connecting_rod [ARGS="--port 8080"]
 	@$(VENV)/bin/attentionvote serve $(bundle) $(ARGS)
