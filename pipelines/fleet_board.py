@@ -6,20 +6,24 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from json_files import write_json
+from promotion_job import DATA_FACT
 from training_job import TrainingJob
 
 from attentionvote.inference import BundleError, load_bundle
 from attentionvote.simulation import SceneSet, scene_set_directory
+
+if TYPE_CHECKING:
+    from attentionvote.registry.promotion import Standing
 
 log = logging.getLogger("attentionvote.fleet")
 _HEAD = ("part", "AP 10 %", "AP 5 %", "AP 2 %", "95 % of AP 10 %", "p50", "champion", "stale data", "state")
 
 
 def row(name: str, job: TrainingJob, answers: Mapping[str, Any], bundles: Path, root: Path, store: str | None) -> dict:
-    """What is known of a part's model.
+    """What is known of a part's model; ``stale`` is of the champion, before there is one of the exported bundle.
 
     Args:
         name: of the part.
@@ -34,14 +38,22 @@ def row(name: str, job: TrainingJob, answers: Mapping[str, Any], bundles: Path, 
     known: dict[str, Any] = {"object": name, "seconds": answers.get("seconds")}
     known |= {key: evaluated.get("figures", {}).get(key) for key in ("ap_10", "ap_5", "ap_2", "latency_p50_ms")}
     known["intervals"] = {key: evaluated.get("intervals", {}).get(key) for key in ("ap_10", "ap_5", "ap_2")}
-    known["bundle"], known["stale"] = None, []
+    known["bundle"], trained_with = None, None
     try:
         loaded = load_bundle(bundle, None)
-        known["bundle"] = loaded.digest
-        known["stale"] = stale_splits(loaded.card.data, job, root)
+        known["bundle"], trained_with = loaded.digest, loaded.card.data
     except BundleError:
         pass  # nothing exported yet
-    known["champion"] = _champion(store, name)
+    standing = _standing(store, name)
+    champion = standing.champion if standing else None
+    known["champion"] = None
+    if standing and champion:
+        age_days = None if standing.since_s is None else round((time.time() - standing.since_s) / 86_400, 2)
+        known["champion"] = {"version": champion.number, "age_days": age_days, "bundle": champion.digest}
+        # Cells run the champion, so its data are what may be stale; a version registered by hand tells none.
+        tags = {name.removeprefix(DATA_FACT): tag for name, tag in champion.tags.items() if name.startswith(DATA_FACT)}
+        trained_with = trained_with if champion.digest == known["bundle"] else tags or None
+    known["stale"] = None if trained_with is None else stale_splits(trained_with, job, root)
     known["failed"] = f"{answers['failed']}: {answers['sentence']}" if answers.get("failed") else None
     return known
 
@@ -63,19 +75,18 @@ def stale_splits(trained_with: Mapping[str, str], job: TrainingJob, root: Path) 
     return stale
 
 
-def _champion(store: str | None, name: str) -> dict[str, Any] | None:
-    """Version, age and bundle of the champion; None when there is none, or no registry."""
+def _standing(store: str | None, name: str) -> Standing | None:
+    """Where the part's champion stands; None without a registry."""
+    from attentionvote.registry.history import History
+    from attentionvote.registry.promotion import stand
     from attentionvote.registry.versions import Versions
 
     try:
-        champion = Versions(store, name).champion()
+        versions = Versions(store, name)
+        return stand(versions, History(versions), carry_out=False)
     except (ValueError, OSError) as error:
         log.warning("the champion of %s is not known: %s", name, error)
         return None
-    if champion is None:
-        return None
-    age_days = (time.time() - champion.created_s) / 86_400
-    return {"version": champion.number, "age_days": round(age_days, 2), "bundle": champion.digest}
 
 
 def cells(known: Mapping[str, Any]) -> list[str]:
@@ -85,7 +96,8 @@ def cells(known: Mapping[str, Any]) -> list[str]:
         told = "none"
     else:
         other = "" if champion["bundle"] == known["bundle"] else ", another bundle"
-        told = f"version {champion['version']}, {champion['age_days']:.0f} d{other}"
+        age = "moved by hand" if champion["age_days"] is None else f"{champion['age_days']:.0f} d"
+        told = f"version {champion['version']}, {age}{other}"
     figures = [known[name] for name in ("ap_10", "ap_5", "ap_2")]
     return [
         known["object"],
@@ -93,7 +105,7 @@ def cells(known: Mapping[str, Any]) -> list[str]:
         "" if sure is None else f"{sure[0]:.3f} to {sure[1]:.3f}",
         "" if known["latency_p50_ms"] is None else f"{known['latency_p50_ms']:.0f} ms",
         told,
-        "" if known["bundle"] is None else ", ".join(known["stale"]) or "no",
+        "" if known["stale"] is None else ", ".join(known["stale"]) or "no",
         known["failed"] or "done",
     ]
 

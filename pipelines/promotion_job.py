@@ -24,6 +24,7 @@ from attentionvote.registry.promotion import Standing, Superseded, move, stand
 from attentionvote.registry.versions import Version, Versions
 
 log = logging.getLogger("attentionvote.promote")
+DATA_FACT = "data."  # and the split: digest of the scenes that a version was trained with, among its tags
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class PromotionJob:
         _show_gates(gates, against)
         failed = [gate for gate in gates if not gate.holds]
         facts = {f"gate.{gate.name}": str(gate) for gate in gates}
+        facts |= {f"{DATA_FACT}{split}": digest for split, digest in self.evaluation.bundle.card.data.items()}
         facts |= {"evaluation.set": frozen.digest, "machine": report["machine"], "compared": against}
         version = self.versions.register(
             self.evaluation.bundle, facts | {"decision": "refused" if failed else "passed"}

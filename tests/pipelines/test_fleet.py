@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,12 @@ from configuration import ConfigurationError, compose
 from export_job import ExportJob
 from json_files import write_json
 from scipy.spatial import ConvexHull
+from train import preset_of_workers
 from training_job import find_training
 
 from attentionvote.execution import LocalPool
+from attentionvote.registry.history import History
+from attentionvote.registry.promotion import move, stand
 from attentionvote.registry.versions import Versions
 from attentionvote.simulation import generate_scene_set, scene_set, scene_set_directory
 
@@ -84,8 +88,8 @@ def test_words_of_the_training_are_handed_on_and_those_of_the_fleet_are_not() ->
 @pytest.mark.parametrize(("gpus", "preset"), [("1.0", "gpu"), ("0", "compact")])
 def test_on_a_cluster_the_jobs_choose_the_preset_not_the_submitting_machine(gpus: str, preset: str) -> None:
     words = ["executor=slurm", f"cluster.gpus={gpus}"]
-    assert fleet.preset_of_workers(compose("fleet", words), words) == [f"experiment={preset}"]
-    assert fleet.preset_of_workers(compose("fleet", words), [*words, "experiment=paper"]) == []
+    assert preset_of_workers(compose("fleet", words), words) == [f"experiment={preset}"]
+    assert preset_of_workers(compose("fleet", words), [*words, "experiment=paper"]) == []
 
 
 def test_exports_and_evaluations_lie_beside_the_trainings() -> None:
@@ -114,12 +118,17 @@ def test_data_is_stale_when_the_configuration_would_generate_other_scenes(
     assert fleet_board.stale_splits({**now, "train": "0" * 64}, job, tmp_path) == ["train", "test"]
 
 
-def test_a_row_tells_of_the_champion_and_of_stale_data(export_brick: Any, job: Any, tmp_path: Path) -> None:
+def test_a_row_tells_of_the_champion_and_of_its_stale_data(
+    export_brick: Any, job: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = f"sqlite:///{tmp_path}/mlflow.db"
     versions = Versions(store, "brick")
+    history = History(versions)
     first = export_brick("first")
-    versions.set_champion(versions.register(first, {}))
-    second = export_brick("second")
+    data = {f"data.{split}": digest for split, digest in first.card.data.items()}
+    version = versions.register(first, data)
+    move(versions, history, stand(versions, history), "promote", version, "the first")
+    second = export_brick("second", card={"data": {"train": "4" * 64, "val": "5" * 64, "test": "6" * 64}})
     answers = {
         "evaluate": {
             "figures": {"ap_10": 0.9, "ap_5": 0.8, "ap_2": 0.4, "latency_p50_ms": 55.4},
@@ -127,15 +136,28 @@ def test_a_row_tells_of_the_champion_and_of_stale_data(export_brick: Any, job: A
         },
         "seconds": 3.0,
     }
-    known = fleet_board.row("brick", job, answers, tmp_path / "outputs" / "export", tmp_path / "data", store)
+    judged: list[Any] = []
+
+    def stale(trained_with: Any, *_: Any) -> list[str]:
+        judged.append(dict(trained_with))
+        return ["train"]
+
+    monkeypatch.setattr(fleet_board, "stale_splits", stale)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 3.2 * 86_400)
+    places = (tmp_path / "outputs" / "export", tmp_path / "data", store)
+    known = fleet_board.row("brick", job, answers, *places)
     assert known["bundle"] == second.digest
-    assert (known["champion"]["version"], known["champion"]["bundle"]) == (1, first.digest)
-    assert 0 <= known["champion"]["age_days"] < 0.01
-    assert known["stale"] == ["train", "val", "test"]
+    assert known["champion"] == {"version": 1, "age_days": pytest.approx(3.2, abs=0.02), "bundle": first.digest}
+    assert judged == [first.card.data]  # of the champion, which cells run
     assert fleet_board.cells(known) == [
-        "brick", "0.900", "0.800", "0.400", "0.850 to 0.940", "55 ms", "version 1, 0 d, another bundle",
-        "train, val, test", "done",
+        "brick", "0.900", "0.800", "0.400", "0.850 to 0.940", "55 ms", "version 1, 3 d, another bundle", "train",
+        "done",
     ]  # fmt: skip
+    versions.set_champion(versions.register(second, {}))
+    by_hand = fleet_board.row("brick", job, answers, *places)
+    assert judged[1:] == [second.card.data]  # the champion is what lies here
+    assert fleet_board.cells(by_hand)[6] == "version 2, moved by hand"
     failed = fleet_board.row("gear", job, {"failed": "train", "sentence": "no disk"}, tmp_path, tmp_path, store)
     assert failed["champion"] is None
     assert fleet_board.cells(failed) == ["gear", "", "", "", "", "", "none", "", "train: no disk"]
@@ -144,7 +166,7 @@ def test_a_row_tells_of_the_champion_and_of_stale_data(export_brick: Any, job: A
     assert [r["object"] for r in rows] == ["rod", "brick", "gear"]
     board = fleet_board.write(tmp_path, rows, {"bunny": "no mesh"})
     text = board.read_text()
-    assert "| brick | 0.900 | 0.800 | 0.400 | 0.850 to 0.940 | 55 ms | version 1, 0 d, another bundle |" in text
+    assert "| brick | 0.900 | 0.800 | 0.400 | 0.850 to 0.940 | 55 ms | version 1, 3 d, another bundle |" in text
     assert "- bunny: no mesh" in text
     stored = json.loads((tmp_path / "leaderboard.json").read_text())
     assert stored == {"members": rows, "left_out": {"bunny": "no mesh"}}

@@ -23,18 +23,20 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def store(tmp_path) -> str:
-    return f"sqlite:///{tmp_path}/mlflow.db"
+def store(request, tmp_path) -> str:
+    """Of SQLite; a test that uses ``database`` runs on every kind."""
+    everywhere = "database" in request.fixturenames
+    return request.getfixturevalue("database") if everywhere else f"sqlite:///{tmp_path}/mlflow.db"
 
 
 @pytest.fixture
-def model(export_brick, store, tmp_path):
+def model(export_brick, store, work_tree):
     """Exports a model that a training in the store made."""
 
     def make(name: str, **changes):
-        with tracking.start_run(store, "brick", config_yaml="a: 1", repository=tmp_path, system_interval_s=0) as run:
+        with tracking.start_run(store, "brick", config_yaml="a: 1", repository=work_tree, system_interval_s=0) as run:
             pass
-        return export_brick(name, run.id, **changes)
+        return export_brick(name, run.id, run.commit, **changes)
 
     return make
 
@@ -51,6 +53,7 @@ def verb(store, few_scenes, easy_gates):
     return call
 
 
+@pytest.mark.usefixtures("database")
 def test_from_promotion_to_rollback(verb, model, store, capsys):
     first = model("one")
     done = verb("promote", "why='the first one'")
@@ -137,7 +140,7 @@ def test_gates_can_be_switched_off_one_by_one(verb, model):
 
 def test_missing_provenance_is_refused(verb, export_brick):
     export_brick("orphan")
-    with pytest.raises(Refused, match="stays a candidate, because 1 of 11 gates failed: config"):
+    with pytest.raises(Refused, match="stays a candidate, because 2 of 11 gates failed: commit, config"):
         verb("promote")
 
 
@@ -169,6 +172,7 @@ def test_a_rollback_to_a_version_whose_artefacts_are_gone_moves_nothing(verb, mo
     assert Versions(store, "brick").champion().number == 2
 
 
+@pytest.mark.usefixtures("database")
 @pytest.mark.slow
 def test_of_two_processes_that_promote_at_once_exactly_one_wins(verb, model, store, few_scenes, easy_gates, tmp_path):
     model("zero")

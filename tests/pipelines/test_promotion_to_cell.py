@@ -86,17 +86,17 @@ class Customer:
 
 @pytest.mark.slow
 def test_a_running_cell_follows_promotion_and_rollback_and_outlives_the_registry(
-    export_brick, make_cloud, few_scenes, easy_gates, tmp_path
+    export_brick, make_cloud, few_scenes, easy_gates, work_tree, tmp_path
 ):
     local = f"sqlite:///{tmp_path}/registry/mlflow.db"
     with serve(local) as server:
 
         def made_by_a_training(name: str):
             with tracking.start_run(
-                server.url, "brick", config_yaml="a: 1", repository=tmp_path, system_interval_s=0
+                server.url, "brick", config_yaml="a: 1", repository=work_tree, system_interval_s=0
             ) as run:
                 pass
-            return export_brick(name, run.id)
+            return export_brick(name, run.id, run.commit)
 
         def promoted():
             return promote.run(compose("promote", [*few_scenes, *easy_gates, f"tracking.store={server.url}"]))

@@ -14,7 +14,7 @@ LIMITS = Limits(0.1, 0.01, 0.1, 0.01, 0.01, 0, 0.002, scenes=32)
 RULES = Rules({"ap_10": 0.9}, {"ap_10": 0.01}, latency_p95_ms=500.0, scenes=100, parity=LIMITS)
 PARITY = Parity(32, 100, 0, 0.0007, 0.0001, 0.0008, 0.0001, 0.0001, {"ap_10": (0.95, 0.95)})
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
-ORIGIN = Origin(True, has_config=True, signed_by="feedfeedfeedfeed")
+ORIGIN = Origin(True, has_config=True, commits=(COMMIT,), has_changes=True, signed_by="feedfeedfeedfeed")
 
 
 def evidence(ap: float, spread: float = 0.0, p95: float = 300.0) -> Evidence:
@@ -102,18 +102,29 @@ def test_the_proof_is_judged_again_whatever_limits_the_export_had(card, record, 
     assert gate.found.startswith(said)
 
 
+DIRTY, OTHER = f"{COMMIT}+dirty", "f" * 40
+
+
 @pytest.mark.parametrize(
-    ("commit", "has_patch", "holds", "found"),
+    ("said", "commits", "has_changes", "holds", "found"),
     [
-        (COMMIT, False, True, COMMIT[:12]),
-        (f"{COMMIT}+dirty", True, True, f"{COMMIT[:12]} with changes that are recorded"),
-        (f"{COMMIT}+dirty", False, False, f"{COMMIT[:12]} with changes that are not recorded"),
-        ("unknown", False, False, "got unknown"),
-        ("", False, False, "got none"),
+        (COMMIT, [COMMIT], False, True, COMMIT[:12]),
+        (DIRTY, [DIRTY], True, True, f"{COMMIT[:12]} with changes that are recorded"),
+        (DIRTY, [DIRTY], False, False, f"{COMMIT[:12]} with changes that are not recorded whole"),
+        (COMMIT, [OTHER, COMMIT], False, True, f"{OTHER[:12]} then {COMMIT[:12]}"),
+        (COMMIT, [DIRTY, COMMIT], False, False, f"{COMMIT[:12]} with changes that are not recorded whole"),
+        (COMMIT, [DIRTY], True, False, f"the card says {COMMIT}, the run {DIRTY}"),
+        (OTHER, [COMMIT], True, False, f"the card says {OTHER}, the run {COMMIT}"),
+        ("unknown", ["unknown"], True, False, "the card says unknown, the run names none"),
+        (COMMIT, [], True, False, f"the card says {COMMIT}, the run names none"),
+        ("", [COMMIT], True, False, f"the card says none, the run {COMMIT}"),
     ],
 )
-def test_the_commit_is_clean_or_its_changes_are_recorded(card, commit, has_patch, holds, found):
-    gate = judged(replace(card, commit=commit), origin=replace(ORIGIN, has_patch=has_patch))["commit"]
+def test_the_commit_is_the_runs_own_and_clean_or_its_changes_are_recorded(
+    card, said, commits, has_changes, holds, found
+):
+    origin = replace(ORIGIN, commits=tuple(commits), has_changes=has_changes)
+    gate = judged(replace(card, commit=said), origin=origin)["commit"]
     assert (gate.holds, gate.found) == (holds, found)
 
 

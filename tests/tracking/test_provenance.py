@@ -1,36 +1,50 @@
-"""Git state of real repositories, cut patches, versions."""
+"""Git state of real repositories, whole and cut patches, versions."""
 
+import json
 import subprocess
 
+from attentionvote import tracking
 from attentionvote.tracking.provenance import git_state, hardware, package_versions
 
 
-def _git(folder, *words):
-    identity = ["-c", "user.name=n", "-c", "user.email=e@example.org", "-c", "commit.gpgsign=false"]
-    subprocess.run(["git", "-C", str(folder), *identity, *words], check=True, capture_output=True)
-
-
-def test_git_state_has_the_changes_of_tracked_files_and_the_names_of_others(tmp_path):
-    _git(tmp_path, "init")
-    (tmp_path / "a.txt").write_text("old\n")
-    _git(tmp_path, "add", "a.txt")
-    _git(tmp_path, "commit", "-m", "first")
-    clean = git_state(tmp_path)
+def test_a_clean_tree_is_its_commit(work_tree):
+    clean = git_state(work_tree)
     assert len(clean.commit) == 40
-    assert not clean.is_dirty
-    assert clean.label == clean.commit
-    assert clean.patch == ""
-    (tmp_path / "a.txt").write_text("new ä\n")
-    (tmp_path / "b.txt").write_text("untracked\n")
-    dirty = git_state(tmp_path)
-    assert dirty.is_dirty
+    assert (clean.is_dirty, clean.label, clean.patch, clean.patch_digest) == (False, clean.commit, "", "")
+
+
+def test_the_patch_brings_the_commit_to_the_working_tree(work_tree, tmp_path):
+    """Changed, new, deleted, staged and binary files; the work_tree itself is only read."""
+    (work_tree / "a.txt").write_text("new ä\n")
+    (work_tree / ".gitignore").write_text("ignored\n")
+    (work_tree / "ignored").write_text("x")
+    (work_tree / "conf").mkdir()
+    (work_tree / "conf" / "my_part.yaml").write_text("name: my_part\n")
+    (work_tree / "mesh.stl").write_bytes(bytes(range(256)))
+    before = subprocess.check_output(["git", "-C", work_tree, "status", "--porcelain"])
+    dirty = git_state(work_tree)
+    assert subprocess.check_output(["git", "-C", work_tree, "status", "--porcelain"]) == before
     assert dirty.label == f"{dirty.commit}+dirty"
-    assert "-old\n+new ä\n" in dirty.patch
-    assert "?? b.txt" in dirty.status
-    (tmp_path / "a.txt").write_text("line\n" * 10_000)
-    cut = git_state(tmp_path, patch_limit=1000).patch
-    assert len(cut) < 1100
-    assert "the first 1000 are kept" in cut
+    assert "?? mesh.stl" in dirty.status
+    blob = subprocess.check_output(["git", "-C", work_tree, "hash-object", "mesh.stl"], text=True).strip()
+    assert f"{'0' * 40}..{blob}" in dirty.patch
+    text = "".join(part for part in dirty.patch.split("diff --git")[1:] if "mesh.stl" not in part.split("\n")[0])
+    assert "ignored\n" in text
+    copy = tmp_path / "copy"
+    subprocess.run(["git", "clone", "-q", work_tree, copy], check=True)
+    whole = "".join("diff --git" + part for part in dirty.patch.split("diff --git")[1:] if "Binary" not in part)
+    subprocess.run(["git", "-C", copy, "apply", "-"], input=whole.encode(), check=True)
+    for name in ("a.txt", ".gitignore", "conf/my_part.yaml"):
+        assert (copy / name).read_bytes() == (work_tree / name).read_bytes()
+    assert len(dirty.patch_digest) == 64
+
+
+def test_a_patch_that_is_cut_is_not_whole(work_tree):
+    (work_tree / "a.txt").write_text("line\n" * 10_000)
+    cut = git_state(work_tree, patch_limit=1000)
+    assert len(cut.patch) < 1100
+    assert "the first 1000 are kept" in cut.patch
+    assert (cut.is_dirty, cut.is_whole, cut.patch_digest) == (True, False, "")
 
 
 def test_git_state_outside_of_a_repository_is_unknown(tmp_path):
@@ -38,17 +52,20 @@ def test_git_state_outside_of_a_repository_is_unknown(tmp_path):
     assert (state.commit, state.is_dirty) == ("unknown", False)
 
 
-def test_dirty_tree_is_stored_with_the_run(store, tmp_path):
-    from attentionvote import tracking
-
-    _git(tmp_path, "init")
-    (tmp_path / "a.txt").write_text("old\n")
-    _git(tmp_path, "add", "a.txt")
-    _git(tmp_path, "commit", "-m", "first")
-    (tmp_path / "a.txt").write_text("new\n")
-    with tracking.start_run(store, "rod", repository=tmp_path, system_interval_s=0) as run:
-        patch = run.download("uncommitted.patch", tmp_path / "out").read_text()
+def test_every_session_of_a_run_names_its_commit_and_keeps_its_changes(store, work_tree, tmp_path):
+    with tracking.start_run(store, "rod", repository=work_tree, system_interval_s=0) as first:
+        pass
+    (work_tree / "a.txt").write_text("new\n")
+    with tracking.start_run(store, "rod", run_id=first.id, repository=work_tree, system_interval_s=0) as run:
+        patch = run.download("resume_1/uncommitted.patch", tmp_path / "out").read_text()
     assert "+new" in patch
+    state = git_state(work_tree)
+    assert (first.commit, run.commit) == (state.commit, state.label)
+    from attentionvote.tracking.store import connect
+
+    tags = connect(store).get_run(run.id).data.tags
+    assert json.loads(tags["git.session_0"]) == {"commit": state.commit, "patch": ""}
+    assert json.loads(tags["git.session_1"]) == {"commit": state.label, "patch": state.patch_digest}
 
 
 def test_versions_and_hardware_are_filled():

@@ -72,13 +72,15 @@ class Origin:
     Attributes:
         found: whether it has the run that the card names.
         has_config: whether the run holds its resolved configuration.
-        has_patch: whether it holds the uncommitted changes of a commit that is not clean.
+        commits: what the run was made with, session by session, as a card names it.
+        has_changes: whether it holds, whole, the changes of every session whose commit was not clean.
         signed_by: fingerprint of the key whose signature was verified.
     """
 
     found: bool
     has_config: bool = False
-    has_patch: bool = False
+    commits: tuple[str, ...] = ()
+    has_changes: bool = False
     signed_by: str = ""
 
 
@@ -153,14 +155,7 @@ def _parity(card: ModelCard, limits: Limits) -> Gate:
 
 
 def _provenance(card: ModelCard, origin: Origin) -> Iterator[Gate]:
-    commit, _, dirty = card.commit.partition("+")
-    known = len(commit) == 40 and set(commit) <= set("0123456789abcdef")
-    found = commit[:12] if known else f"got {card.commit or 'none'}"
-    if known and dirty:
-        found += f" with changes that are {'recorded' if origin.has_patch else 'not recorded'}"
-    yield Gate(
-        "commit", known and (not dirty or origin.has_patch), "a commit, clean or with its changes recorded", found
-    )
+    yield _commit(card.commit, origin)
     missing = [split for split in ("train", "val", "test") if not card.data.get(split)]
     digests = ", ".join(f"{split} {digest[:8]}" for split, digest in card.data.items())
     yield Gate("data", not missing, "digests of all scene sets", digests if not missing else f"no {missing[0]} digest")
@@ -173,3 +168,23 @@ def _provenance(card: ModelCard, origin: Origin) -> Iterator[Gate]:
     yield Gate("versions", not lacking, "versions of what made it", f"no {lacking[0]}" if lacking else versions)
     signed = f"key {origin.signed_by}" if origin.signed_by else "no signature was verified"
     yield Gate("signature", bool(origin.signed_by), "the signature of the trusted key", signed)
+
+
+def _commit(said: str, origin: Origin) -> Gate:
+    demands = "the commit that its run names, clean or with its changes recorded"
+    known = [len(name) == 40 and set(name) <= set("0123456789abcdef") for name, _ in map(_split, origin.commits)]
+    if not origin.commits or not all(known):
+        return Gate("commit", False, demands, f"the card says {said or 'none'}, the run names none")
+    if said != origin.commits[-1]:
+        return Gate("commit", False, demands, f"the card says {said or 'none'}, the run {origin.commits[-1]}")
+    dirty = any(changes for _, changes in map(_split, origin.commits))
+    found = " then ".join(dict.fromkeys(_split(commit)[0][:12] for commit in origin.commits))
+    if dirty:
+        found += f" with changes that are {'recorded' if origin.has_changes else 'not recorded whole'}"
+    return Gate("commit", not dirty or origin.has_changes, demands, found)
+
+
+def _split(commit: str) -> tuple[str, bool]:
+    """The hash, and whether the work tree differed from it."""
+    name, _, changes = commit.partition("+")
+    return name, bool(changes)

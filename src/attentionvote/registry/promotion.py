@@ -31,6 +31,7 @@ class Standing:
         previous: version numbers that a rollback would come to, the next one last.
         ever: version numbers that have been champion, oldest first.
         astray: a sentence when the alias is not where the history left it; empty otherwise.
+        since_s: when the champion was made it, seconds since 1970; None when there is none or it was changed by hand.
     """
 
     champion: Version | None
@@ -38,6 +39,7 @@ class Standing:
     previous: tuple[int, ...]
     ever: tuple[int, ...]
     astray: str = ""
+    since_s: float | None = None
 
 
 def stand(versions: Versions, history: History, carry_out: bool = True) -> Standing:
@@ -80,6 +82,7 @@ def stand(versions: Versions, history: History, carry_out: bool = True) -> Stand
         previous,
         tuple(dict.fromkeys(move.version for move in moves)),
         astray,
+        moves[-1].when_s if moves and now == moves[-1].version else None,
     )
 
 

@@ -8,6 +8,8 @@ that cells follow.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import logging
 import os
 import tempfile
@@ -19,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from attentionvote.inference import Bundle, BundleError, load_bundle
 from attentionvote.inference.bundle import Trusted
 from attentionvote.registry.gates import Origin
+from attentionvote.tracking.run_opening import PATCH, SESSION_TAG, session_folder
 from attentionvote.tracking.store import connect, experiment_id, resolve_store
 
 if TYPE_CHECKING:
@@ -150,13 +153,31 @@ class Versions:
             run_id: as the model's card names it.
             signed_by: fingerprint of the key whose signature of the bundle was verified.
         """
-        if self._run(run_id) is None:
+        run = self._run(run_id)
+        if run is None:
             return Origin(False, signed_by=signed_by)
-        files = [file.path for file in self.client.list_artifacts(run_id)]
-        resumed = [name for name in files if name.startswith("resume_")]
-        files += [file.path for folder in resumed for file in self.client.list_artifacts(run_id, folder)]
-        has_patch = any(name.rpartition("/")[2] == "uncommitted.patch" for name in files)
-        return Origin(True, "config.yaml" in files, has_patch, signed_by)
+        tags = run.data.tags
+        try:
+            numbers = sorted(int(name.removeprefix(SESSION_TAG)) for name in tags if name.startswith(SESSION_TAG))
+            sessions = {number: json.loads(tags[f"{SESSION_TAG}{number}"]) for number in numbers}
+            commits = tuple(str(session["commit"]) for session in sessions.values())
+            dirty = {number: session["patch"] for number, session in sessions.items() if "+" in session["commit"]}
+            whole = all(self._has_changes(run_id, number, digest) for number, digest in dirty.items())
+        except (KeyError, TypeError, ValueError):  # not written by us
+            commits, whole = (), False
+        has_config = any(file.path == "config.yaml" for file in self.client.list_artifacts(run_id))
+        return Origin(True, has_config, commits, whole, signed_by)
+
+    def _has_changes(self, run_id: str, session: int, digest: str) -> bool:
+        """Whether the patch of a session is there as it was written."""
+        from mlflow.exceptions import MlflowException
+
+        with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
+            try:
+                path = Path(self.client.download_artifacts(run_id, session_folder(session) + PATCH, folder))
+            except (MlflowException, OSError):
+                return False
+            return bool(digest) and hashlib.sha256(path.read_bytes()).hexdigest() == digest
 
     def set_champion(self, version: Version) -> None:
         """Move the alias; cells follow within their polling time."""

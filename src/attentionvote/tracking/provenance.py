@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import os
 import platform
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 PACKAGES = ("attentionvote", "torch", "lightning", "mlflow", "numpy", "scipy", "hydra-core", "mujoco-core", "trimesh")
 PATCH_LIMIT_BYTES = 1_000_000
+_PLACES = ("index", "objects")
 
 
 @dataclass(frozen=True)
 class GitState:
-    """State of the working tree: commit (or "unknown"), `git status` lines, and the patch of tracked files."""
+    """State of the working tree.
+
+    Attributes:
+        commit: checked out, or "unknown".
+        status: lines of `git status`.
+        patch: from the commit to the working tree, new files included; changed binary files by the hash of their blob.
+        is_whole: whether the patch holds every change.
+    """
 
     commit: str
     status: str
     patch: str
+    is_whole: bool = True
 
     @property
     def is_dirty(self) -> bool:
@@ -33,32 +45,60 @@ class GitState:
         """The commit, with ``+dirty`` behind it when the work tree differs: what a model's card says."""
         return f"{self.commit}+dirty" if self.is_dirty else self.commit
 
+    @property
+    def patch_digest(self) -> str:
+        """Sha256 of the patch; empty when there are no changes or it does not hold all of them."""
+        return hashlib.sha256(self.patch.encode()).hexdigest() if self.is_dirty and self.is_whole else ""
 
-def _git(folder: Path, *arguments: str, limit: int | None = None) -> str:
+
+def _git(folder: Path, *arguments: str, environment: Mapping[str, str] | None = None) -> bytes | None:
+    """What git prints; None when it fails."""
     command = ["git", "-C", str(folder), "--no-optional-locks", "-c", "core.quotepath=off", *arguments]
     try:
-        result = subprocess.run(command, capture_output=True, timeout=20, check=True)
+        return subprocess.run(
+            command, capture_output=True, timeout=20, check=True, env={**os.environ, **(environment or {})}
+        ).stdout
     except (OSError, subprocess.SubprocessError):
-        return ""
-    text = result.stdout
-    if limit is not None and len(text) > limit:
-        cut = f"\n[cut: {len(text)} bytes, the first {limit} are kept]\n"
-        return text[:limit].decode("utf-8", errors="ignore") + cut
-    return text.decode("utf-8", errors="replace")
+        return None
 
 
 def git_state(folder: Path, patch_limit: int = PATCH_LIMIT_BYTES) -> GitState:
     """The working tree that ``folder`` lies in; everything empty and commit "unknown" outside of one.
 
-    Untracked files appear in ``status`` by name only; the patch is cut at ``patch_limit`` bytes and says so.
+    The patch is cut at ``patch_limit`` bytes and says so.
     """
-    commit = _git(folder, "rev-parse", "HEAD").strip()
+    commit = (_git(folder, "rev-parse", "HEAD") or b"").decode().strip()
     if not commit:
         return GitState("unknown", "", "")
-    # The content of changed binary files says nothing to a reader, their names are in the status.
-    return GitState(
-        commit, _git(folder, "status", "--porcelain", limit=100_000), _git(folder, "diff", "HEAD", limit=patch_limit)
-    )
+    status = (_git(folder, "status", "--porcelain") or b"")[:100_000].decode(errors="replace")
+    if not status:
+        return GitState(commit, "", "")
+    changes = _changes(folder)
+    whole = changes is not None and len(changes) <= patch_limit
+    changes = changes if changes is not None else _git(folder, "diff", "HEAD") or b""
+    if len(changes) <= patch_limit:
+        return GitState(commit, status, changes.decode(errors="replace"), whole)
+    cut = f"\n[cut: {len(changes)} bytes, the first {patch_limit} are kept]\n"
+    return GitState(commit, status, changes[:patch_limit].decode(errors="ignore") + cut, False)
+
+
+def _changes(folder: Path) -> bytes | None:
+    """The patch with new files; None when git cannot make it in time.
+
+    Staged into an index and objects of its own, so that the user's repository is only read.
+    """
+    index, objects = ((_git(folder, "rev-parse", "--git-path", name) or b"").decode().strip() for name in _PLACES)
+    with tempfile.TemporaryDirectory(prefix="attentionvote-") as scratch:
+        own = {"GIT_INDEX_FILE": f"{scratch}/index", "GIT_OBJECT_DIRECTORY": f"{scratch}/objects"}
+        own["GIT_ALTERNATE_OBJECT_DIRECTORIES"] = str((folder / objects).resolve())
+        try:
+            Path(own["GIT_OBJECT_DIRECTORY"]).mkdir()
+            shutil.copyfile(folder / index, own["GIT_INDEX_FILE"])
+        except OSError:
+            return None
+        if _git(folder, "add", "--all", environment=own) is None:
+            return None
+        return _git(folder, "diff", "--cached", "--full-index", "HEAD", environment=own)
 
 
 def package_versions() -> dict[str, str]:

@@ -50,6 +50,7 @@ class Run:
         found = client.get_run(run_id)
         self.id: str = run_id
         self.store = uri
+        self.commit = ""  # of the code that runs, as a model's card names it
         self.experiment_id: str = found.info.experiment_id
         self.experiment: str = client.get_experiment(self.experiment_id).name
         self.status: str = "RUNNING"

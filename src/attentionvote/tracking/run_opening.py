@@ -18,6 +18,13 @@ if TYPE_CHECKING:
     from mlflow.entities import Run as MlflowRun
 
 PARENT_TAG = "mlflow.parentRunId"  # what MLflow's pages nest runs by
+SESSION_TAG = "git.session_"  # and the session's number: its commit, and the digest of its changes
+PATCH = "uncommitted.patch"
+
+
+def session_folder(session: int) -> str:
+    """Where the files of a session lie; what the run began with is never overwritten."""
+    return f"resume_{session}/" if session else ""
 
 
 def start_run(
@@ -91,12 +98,14 @@ def start_run(
 
 def _record_origin(run: Run, session: int, config_yaml: str, repository: Path) -> None:
     git = provenance.git_state(repository)
+    run.commit = git.label
     hardware, versions = provenance.hardware(), provenance.package_versions()
     command = provenance.command_line()
     run.log_tags(
         {
             "git.commit": git.commit,
             "git.dirty": str(git.is_dirty).lower(),
+            f"{SESSION_TAG}{session}": json.dumps({"commit": git.label, "patch": git.patch_digest}),
             "mlflow.source.git.commit": git.commit,
             "mlflow.source.name": sys.argv[0],
             "mlflow.source.type": "LOCAL",
@@ -104,13 +113,13 @@ def _record_origin(run: Run, session: int, config_yaml: str, repository: Path) -
             **{f"version.{key}": value for key, value in versions.items()},
         }
     )
-    folder = f"resume_{session}/" if session else ""  # what the run began with is never overwritten
+    folder = session_folder(session)
     if config_yaml:
         run.log_text(f"{folder}config.yaml", config_yaml)
     environment = {"command": command, "hardware": hardware, "versions": versions, "git_commit": git.commit}
     run.log_text(f"{folder}environment.json", json.dumps(environment, indent=2) + "\n")
     if git.is_dirty:
-        run.log_text(f"{folder}uncommitted.patch", git.patch)
+        run.log_text(f"{folder}{PATCH}", git.patch)
         run.log_text(f"{folder}uncommitted_status.txt", git.status)
     with contextlib.suppress(KeyError):
         run.log_tags({"mlflow.user": os.environ["USER"]})
