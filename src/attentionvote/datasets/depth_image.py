@@ -7,6 +7,8 @@ convert it to 8 bits gets a relief of 256 steps and no error.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -141,6 +143,16 @@ def read_labels(path: Path) -> NDArray[np.int64]:
     return pixels.astype(np.int64)
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image, without decoding it.
+
+    Raises:
+        ValueError: with one sentence, when the file is missing or no image.
+    """
+    with _opened(path) as image:
+        return image.size
+
+
 def write_image(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write ``(H, W)`` as a grey PNG of its own depth (8 or 16 bits), whole or not at all."""
     from PIL import Image
@@ -152,16 +164,22 @@ def write_image(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> N
 
 
 def _read(path: Path) -> tuple[NDArray[Any], str]:
+    with _opened(path) as image:
+        if image.width * image.height > MOST_PIXELS:
+            raise ValueError(f"at most {MOST_PIXELS} pixels are read, it has {image.width} x {image.height}")
+        image.load()
+        return np.asarray(image), image.mode
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     from PIL import Image
 
     if not path.is_file():
         raise ValueError(f"{path}: the image does not exist")
     try:
         with Image.open(path, formats=["PNG", "TIFF"]) as image:
-            if image.width * image.height > MOST_PIXELS:
-                raise ValueError(f"at most {MOST_PIXELS} pixels are read, it has {image.width} x {image.height}")
-            image.load()
-            return np.asarray(image), image.mode
+            yield image
     except Exception as error:  # Pillow's decoders let many kinds of exceptions through
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: the image cannot be decoded, is it whole? ({reason})") from error

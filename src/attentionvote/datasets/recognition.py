@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from attentionvote.datasets.bop import BopDataset
 from attentionvote.datasets.dataset import Dataset
 from attentionvote.datasets.ipa import IpaDataset
 from attentionvote.datasets.sileane import CAMERA_FILE, DEPTH_FOLDERS, SileaneDataset
@@ -15,6 +16,7 @@ LEVELS = 4
 LOOKS = {
     "IPA": "<split>/<Object>/ with parameter.json and gt/cycle_*/ or p_depth/cycle_*/",
     "Sileane": "<object>/ with camera_params.txt and gt/*.json or depth/*.PNG",
+    "BOP": "<split>/000000/ with scene_camera.json or scene_camera_<sensor>.json",
 }
 
 
@@ -26,10 +28,10 @@ def open_datasets(directory: Path) -> list[Dataset]:
     """
     if not directory.is_dir():
         raise ValueError(f"{directory}: the folder of a dataset must exist, got {_what(directory)}")
-    found: dict[tuple[Callable[[list[Path]], list[Dataset]], Path, str], list[Path]] = {}
+    found: dict[tuple[Opener, Path, str], list[Path]] = {}
     for folder, opener, group in _folders(directory, LEVELS):
         found.setdefault((opener, folder.parent, group), []).append(folder)
-    datasets = [dataset for (opener, _, _), folders in found.items() for dataset in opener(folders)]
+    datasets = [dataset for (opener, _, group), folders in found.items() for dataset in opener(folders, group)]
     if not datasets:
         looks = "; ".join(f"{name}: {look}" for name, look in LOOKS.items())
         raise ValueError(f"{directory} must hold a dataset of a known layout, got none of them ({looks})")
@@ -49,12 +51,15 @@ def _what(directory: Path) -> str:
     return "a file" if directory.exists() else "nothing there"
 
 
-Recognised = tuple[Path, Callable[[list[Path]], list[Dataset]], str]
+Opener = Callable[[list[Path], str], list[Dataset]]
 
 
-def _folders(folder: Path, levels: int) -> Iterator[Recognised]:
+def _folders(folder: Path, levels: int) -> Iterator[tuple[Path, Opener, str]]:
     """Folders of datasets at or below ``folder``, each with what opens it and the group it is opened with."""
-    if _is_ipa(folder):
+    sensors = sorted(path.stem.removeprefix("scene_camera").lstrip("_") for path in folder.glob("scene_camera*.json"))
+    if sensors:
+        yield from ((folder, _open_bop, sensor) for sensor in sensors)
+    elif _is_ipa(folder):
         yield folder, _open_ipa, re.sub(r"_part_\d+$", "", folder.resolve().name)
     elif _is_sileane(folder):
         yield folder, _open_sileane, folder.name
@@ -72,11 +77,15 @@ def _is_sileane(folder: Path) -> bool:
     return (folder / CAMERA_FILE).is_file() and any(place.is_dir() for place in places)
 
 
-def _open_sileane(folders: list[Path]) -> list[Dataset]:
+def _open_bop(folders: list[Path], sensor: str) -> list[Dataset]:
+    return [BopDataset(folders, sensor)]
+
+
+def _open_sileane(folders: list[Path], _: str) -> list[Dataset]:
     return [SileaneDataset(folder) for folder in folders]
 
 
-def _open_ipa(folders: list[Path]) -> list[Dataset]:
+def _open_ipa(folders: list[Path], _: str) -> list[Dataset]:
     split = split_of(folders[0].resolve().parent)
     datasets: list[Dataset] = []
     for place, real in (("p_depth", False), ("p_depth_real_world", True)):

@@ -44,7 +44,7 @@ class SileaneCamera(NamedTuple):
 
 
 def label_of(index: int, count: int) -> int:
-    """Label of part ``index`` of ``count``; halves go up, as in the dataset's own files (Python's ``round`` does not)."""
+    """Label of part ``index`` of ``count``; halves go up, as in the dataset's own files (``round`` does not)."""
     return (2 * TOP * (count - index) + count) // (2 * count)
 
 
