@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from hardware import cores
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from several_parts import only_part
 
 from attentionvote.inference import Bundle, load_bundle
 from attentionvote.inference.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
@@ -44,7 +45,7 @@ class EvaluationJob:
         Raises:
             ValueError: when there is no such bundle, it cannot be trusted, or a setting is impossible.
         """
-        part: Part = instantiate(cfg.object)
+        part = only_part(instantiate(cfg.object), "an evaluation")
         settings = OmegaConf.to_container(cfg.simulation, resolve=True)
         assert isinstance(settings, dict)
         spec = scene_set_specs(part, settings | {"cycles": {SPLIT: cfg.evaluation.cycles}})[SPLIT]

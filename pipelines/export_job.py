@@ -19,6 +19,7 @@ from hardware import cores
 from hydra.utils import instantiate
 from json_files import read_json, write_json
 from omegaconf import DictConfig
+from several_parts import only_part
 from training_job import MODEL, RESULT
 
 import attentionvote
@@ -62,7 +63,7 @@ class ExportJob:
         Raises:
             ValueError: when there is no such training, or more than one; or when the key cannot be had.
         """
-        part: Part = instantiate(cfg.object)
+        part = only_part(instantiate(cfg.object), "an export")
         if cfg.scenes < cfg.limits.scenes:
             raise ValueError(f"scenes must be at least limits.scenes ({cfg.limits.scenes}), got {cfg.scenes}")
         folder = Path(cfg.trained) / part.name

@@ -67,9 +67,9 @@ class Range:
 RANGES: tuple[Range, ...] = (
     Range("seed", low=0, high=2**32 - 1),
     Range("*.seed", low=0, high=2**32 - 1),
-    Range("object.diameter", above=0, high=10, kind=float),
-    Range("object.base_radius", above=0, high=10, kind=float),
-    Range("object.voxel_size", above=0, high=10, kind=float),
+    Range("object.*diameter", above=0, high=10, kind=float),
+    Range("object.*base_radius", above=0, high=10, kind=float),
+    Range("object.*voxel_size", above=0, high=10, kind=float),
     Range("run", kind=str),
     Range("signing_keys", kind=str),
     Range("triton", kind=str),
@@ -180,7 +180,7 @@ RANGES: tuple[Range, ...] = (
 )
 
 # Settings that may be negative: coordinates, angles and offsets.
-SIGNED: tuple[str, ...] = ("object.symmetry.*", "*axis*", "*offset*")
+SIGNED: tuple[str, ...] = ("object.*symmetry.*", "*axis*", "*offset*")
 
 # Settings that name a database or a server.
 ADDRESSES = ("tracking.store", "storage")

@@ -16,6 +16,7 @@ from folder_lock import locked_folder
 from hydra.utils import instantiate
 from json_files import read_json
 from omegaconf import DictConfig, OmegaConf
+from several_parts import only_part
 
 from attentionvote.part import Part
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_specs
@@ -70,7 +71,7 @@ def find_training(cfg: DictConfig) -> TrainingJob:
         ValueError: with one sentence, when the parts of the configuration do not fit together.
         OSError: when the part's mesh is missing.
     """
-    part: Part = instantiate(cfg.object)
+    part = only_part(instantiate(cfg.object), "a training")
     specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation, resolve=True))
     _check(cfg, specs)
     plain = OmegaConf.to_container(cfg, resolve=True)

@@ -13,16 +13,15 @@ from command import ConfigurationError, command, configuring
 from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
-    from attentionvote.part import Part
+    from attentionvote.part import Parts
     from attentionvote.simulation import PartCaster, SceneRecord, SceneSetSpec
 
 log = logging.getLogger("attentionvote.view")
 
 
-def find_record(part: Part, caster: PartCaster, spec: SceneSetSpec, directory: Path, scene: int) -> SceneRecord:
+def find_record(part: Parts, caster: PartCaster, spec: SceneSetSpec, directory: Path, scene: int) -> SceneRecord:
     """Scene number ``scene`` of a set, or of the cycle it would belong to, when the set is not complete."""
-    from attentionvote.simulation.decomposition import convex_hulls
-    from attentionvote.simulation.scene_set import SceneSet, simulate_cycle
+    from attentionvote.simulation.scene_set import SceneSet, simulate_cycle, solids_of
 
     per_cycle = len(spec.drop_counts)
     if scene >= spec.cycles * per_cycle:
@@ -34,8 +33,7 @@ def find_record(part: Part, caster: PartCaster, spec: SceneSetSpec, directory: P
         return records[scene]
     cycle, entry = divmod(scene, per_cycle)
     log.info("%s is not generated yet: simulating its cycle %d", directory, cycle)
-    hulls = convex_hulls(part, spec.drop.hull_threshold, spec.drop.hull_vertices)
-    cycle_records = simulate_cycle(part, hulls, caster, spec, cycle)
+    cycle_records = simulate_cycle(part, solids_of(part, spec.drop), caster, spec, cycle)
     if not cycle_records:
         raise ConfigurationError(f"scene must lie in a cycle with a settled pile, cycle {cycle} has none; got {scene}")
     return cycle_records[min(entry, len(cycle_records) - 1)]

@@ -15,7 +15,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 from schema import violation
 
-from attentionvote.part import Part
+from attentionvote.part import Part, PartSet
 
 FILES = sorted(CONF.rglob("*.yaml"))
 VERBS = [p.stem for p in FILES if p.parent == CONF]
@@ -115,6 +115,11 @@ def test_object_describes_a_part(
         if not Path(settings.mesh).exists():
             pytest.skip(f"the check data has no {Path(settings.mesh).name}")
     part = instantiate(settings)
-    assert isinstance(part, Part)
     assert part.name == name
+    if "parts" in settings:
+        assert isinstance(part, PartSet)
+        assert [one.name for one in part.parts] == list(settings.parts)
+        assert part.diameter == max(one.diameter for one in settings.parts.values())
+        return
+    assert isinstance(part, Part)
     assert part.diameter == pytest.approx(settings.diameter)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.part import Part, surface_moments
+from attentionvote.part import Part, PartSet, surface_moments
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -137,3 +138,34 @@ NAN = np.where(np.arange(24).reshape(8, 3) == 5, np.nan, CORNERS)
 def test_impossible_parts_are_refused(changes: dict, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         box(**changes)
+
+
+def test_a_set_of_one_part_is_that_part() -> None:
+    part = box()
+    alone = PartSet("bin", (part,))
+    assert alone.digest == part.digest
+    assert alone.diameter == part.diameter
+    np.testing.assert_array_equal(alone.box, part.box)
+    assert alone.parts == part.parts == (part,)
+
+
+def test_a_set_is_as_large_as_its_largest_part_and_knows_the_order() -> None:
+    long, wide = box((0.1, 0.04, 0.02)), replace(box((0.05, 0.06, 0.03)), name="wide")
+    both = PartSet("bin", (long, wide))
+    assert both.diameter == long.diameter
+    np.testing.assert_allclose(both.box, [[-0.05, -0.03, -0.015], [0.05, 0.03, 0.015]])
+    assert len({both.digest, PartSet("bin", (wide, long)).digest, long.digest, wide.digest}) == 4
+    assert PartSet("other", (long, replace(wide, name="broad"))).digest == both.digest
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ((), "bin: a set must have at least one part, got none"),
+        ((box(), box((0.2, 0.1, 0.1))), "bin: the parts of a set must have names of their own, got box twice"),
+        ((box(), replace(box(), name="twin")), "bin: the parts of a set must differ, but box is twin"),
+    ],
+)
+def test_impossible_sets(parts: tuple[Part, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PartSet("bin", parts)

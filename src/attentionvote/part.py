@@ -1,7 +1,10 @@
-"""A part: what the network looks for. Name, surface, diameter, symmetry, and its metric.
+"""A part: what the network looks for. Name, surface, diameter, symmetry, and its metric. And a set of them in one bin.
 
 The diameter is a constant of the part's configuration, because benchmarks define it differently
 (largest vertex distance, centroid sphere, bounding sphere); it is derived only for new parts.
+
+Whoever works on "what lies in the bin" takes ``Parts``: a part is a set of itself (``parts``), and answers for lengths,
+name and digest as a set does.
 """
 
 from __future__ import annotations
@@ -73,6 +76,16 @@ class Part:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What may lie in the bin: this part."""
+        return (self,)
+
+    @cached_property
+    def box(self) -> NDArray[np.float64]:
+        """``(2, 3)`` lowest and highest corner in the part frame, metres."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
     @cached_property
     def covariance_root(self) -> NDArray[np.float64]:
         """Lambda ``(3, 3)`` in metres: matrix root of the surface covariance (Bregier et al. 2017)."""
@@ -96,3 +109,58 @@ class Part:
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         return a[index] + u * (b[index] - a[index]) + v * (c[index] - a[index])
+
+
+@dataclass(frozen=True, eq=False)
+class PartSet:
+    """Several parts that lie in one bin and that one network looks for (paper section 4.1, Table 6).
+
+    The classes of the network are the parts in their order. A set of one part has that part's digest: scenes, clouds
+    and models of both are the same.
+
+    Args:
+        name: stem of the set's configuration file.
+        parts: the parts, in the order of the classes.
+        title: one line for people.
+
+    Raises:
+        ValueError: with one sentence, without a part, or when two could not be told apart.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self.parts))
+        if not self.parts:
+            raise ValueError(f"{self.name}: a set must have at least one part, got none")
+        for i, part in enumerate(self.parts):
+            for other in self.parts[:i]:
+                if part.name == other.name:
+                    raise ValueError(
+                        f"{self.name}: the parts of a set must have names of their own, got {part.name} twice"
+                    )
+                if part.digest == other.digest:
+                    raise ValueError(f"{self.name}: the parts of a set must differ, but {other.name} is {part.name}")
+
+    @property
+    def diameter(self) -> float:
+        """D of the largest part in metres: the lengths of network and bin are shares of it."""
+        return max(part.diameter for part in self.parts)
+
+    @cached_property
+    def box(self) -> NDArray[np.float64]:
+        """``(2, 3)`` corners in metres of the box that holds every part in its own frame."""
+        boxes = np.stack([part.box for part in self.parts])
+        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+    @cached_property
+    def digest(self) -> str:
+        """Sha256 of what the parts are, in their order; neither the set's name nor theirs."""
+        if len(self.parts) == 1:
+            return self.parts[0].digest
+        return hashlib.sha256("".join(part.digest for part in self.parts).encode()).hexdigest()
+
+
+Parts = Part | PartSet  # what lies in a bin

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,14 +15,15 @@ from attentionvote.geometry.pose import apply
 from attentionvote.part import Part
 from attentionvote.simulation import drop, load_part
 from attentionvote.simulation.decomposition import Hulls, convex_hulls
-from attentionvote.simulation.drop import BinSettings, DropSettings, drop_parts
+from attentionvote.simulation.drop import BinSettings, DropSettings, Solid, drop_parts
 
 BIN = np.array([0.15, 0.12, 0.1])
 
 
 def piles(part: Part, hulls: Hulls, count: int, bin_size: NDArray = BIN, seed: int = 0, **settings: object) -> list:
     rng = np.random.default_rng(seed)
-    return list(drop_parts(part, hulls, count, bin_size, 0.4, DropSettings(**settings), rng))  # type: ignore[arg-type]
+    part_ids, physics = np.zeros(count, dtype=np.int32), DropSettings(**settings)  # type: ignore[arg-type]
+    return list(drop_parts([Solid(part, hulls)], part_ids, bin_size, 0.4, physics, rng))
 
 
 def test_every_drop_adds_a_part_that_rests_inside_the_bin(bracket: Part, hulls: Hulls) -> None:
@@ -90,17 +92,19 @@ def test_an_exploded_pile_ends_the_cycle(
 
 
 def test_physics_settings_reach_the_model(bracket: Part, hulls: Hulls) -> None:
-    mass, centre, inertia = drop._mass_properties(bracket)
+    mass, _, inertia = properties = drop._mass_properties(bracket)
+    solid, three = Solid(bracket, hulls), np.zeros(3, dtype=np.int32)
     volume = 0.06 * 0.02 * 0.008 + 0.008 * 0.02 * 0.032
     assert mass == pytest.approx(volume * 2700, rel=1e-6)
-    model = drop._build_model(hulls, 3, BIN, 0.35, DropSettings(), 0.08, mass, centre, inertia)
+    model = drop._build_model([solid], [properties], three, BIN, 0.35, DropSettings())
     assert model.opt.timestep == 0.004
     assert (model.opt.iterations, model.opt.ls_iterations) == (100, 50)
     np.testing.assert_allclose(model.geom_friction, np.broadcast_to((0.35, 0.005, 0.0001), model.geom_friction.shape))
     np.testing.assert_allclose(model.geom_solref, np.broadcast_to((0.01, 1.0), model.geom_solref.shape))
     np.testing.assert_allclose(model.body_mass[1:], mass)
     np.testing.assert_allclose(sorted(model.body_inertia[1]), np.linalg.eigvalsh(inertia), rtol=1e-6)
-    small = drop._build_model(hulls, 1, BIN, 0.35, DropSettings(), 0.039, mass, centre, inertia)
+    tiny = Solid(replace(bracket, diameter=0.039), hulls)
+    small = drop._build_model([tiny], [properties], three[:1], BIN, 0.35, DropSettings())
     assert small.opt.timestep == 0.002
     assert small.geom_solref[0, 0] == 0.005
 
@@ -148,7 +152,8 @@ def test_true_surfaces_neither_penetrate_nor_hover(name: str, slow: SimpleNamesp
     part = load_part(name, f"builtin:{name}")
     hulls, rng = convex_hulls(part, cache=tmp_path), np.random.default_rng(0)
     size = BinSettings().sample(BinSettings().scaling_diameter(part, 30), rng)
-    poses = list(drop_parts(part, hulls, 12, size, 0.4, DropSettings(), rng))[-1].bin_from_part
+    part_ids = np.zeros(12, dtype=np.int32)
+    poses = list(drop_parts([Solid(part, hulls)], part_ids, size, 0.4, DropSettings(), rng))[-1].bin_from_part
     assert len(poses) == 12
     triangles = part.vertices[part.faces]
     vertices = part.vertices[rng.permutation(len(part.vertices))[:400]]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from attentionvote.data.clouds import CloudSettings, measure, measure_into
 from attentionvote.execution import Executor, WorkerDied, run_all
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.scene import Scene
 from attentionvote.simulation import PartCaster, SceneRecord
 
@@ -24,7 +24,7 @@ from attentionvote.simulation import PartCaster, SceneRecord
 class CloudTask:
     """Measures a scene; a worker builds the ray caster for its first one."""
 
-    part: Part
+    part: Parts
     settings: CloudSettings
 
     def __call__(self, record: SceneRecord) -> Scene:

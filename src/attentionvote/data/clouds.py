@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from attentionvote.execution import Executor
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.scene import Scene
 from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor, synthesize
 
@@ -90,7 +90,7 @@ class Clouds:
                 instance_ids=self._arrays["instance_ids"][index, :count].astype(np.int32),
                 camera_from_part=record.camera_from_part,
                 visible_fraction=record.visible_fraction,
-                part_ids=np.zeros(len(record.camera_from_part), dtype=np.int32),
+                part_ids=record.part_ids,
             )
         except ValueError as error:
             raise ValueError(
@@ -124,7 +124,7 @@ def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) ->
 
 def measure_clouds(
     scenes: SceneSet,
-    part: Part,
+    part: Parts,
     settings: CloudSettings,
     root: Path,
     workers: int,
@@ -138,7 +138,7 @@ def measure_clouds(
 
     Args:
         scenes: the scene set.
-        part: its part.
+        part: its part, or set of parts.
         settings: sensor, density, pool.
         root: clouds are kept in ``root/<part>/<key>``.
         workers: processes; the result does not depend on it.

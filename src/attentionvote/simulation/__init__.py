@@ -12,6 +12,7 @@ _MODULE_OF = {
     "largest_vertex_distance": "mesh",
     "load_surface": "mesh",
     "load_part": "part_files",
+    "load_parts": "part_files",
     "detect_symmetry": "symmetry_detection",
     "symmetry_residual": "symmetry_detection",
     "Camera": "camera",

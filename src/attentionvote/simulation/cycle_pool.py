@@ -13,8 +13,8 @@ from functools import cached_property
 from pathlib import Path
 
 from attentionvote.execution import Executor, WorkerDied, run_all
-from attentionvote.part import Part
-from attentionvote.simulation.decomposition import Hulls
+from attentionvote.part import Parts
+from attentionvote.simulation.drop import Solid
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 from attentionvote.simulation.scene_set import simulate_cycle, store_cycle
@@ -25,13 +25,13 @@ from attentionvote.simulation.scene_spec import SceneSetSpec
 class CycleTask:
     """Simulates a cycle; a worker builds the ray caster for its first one."""
 
-    part: Part
-    hulls: Hulls
+    part: Parts
+    solids: Sequence[Solid]
     spec: SceneSetSpec
 
     def __call__(self, cycle: int) -> list[SceneRecord]:
         """The scenes of a cycle."""
-        return simulate_cycle(self.part, self.hulls, self._caster, self.spec, cycle)
+        return simulate_cycle(self.part, self.solids, self._caster, self.spec, cycle)
 
     def __getstate__(self) -> dict[str, object]:
         return {name: value for name, value in self.__dict__.items() if name != "_caster"}
@@ -42,8 +42,8 @@ class CycleTask:
 
 
 def run_cycles(
-    part: Part,
-    hulls: Hulls,
+    part: Parts,
+    solids: Sequence[Solid],
     spec: SceneSetSpec,
     directory: Path,
     cycles: Sequence[int],
@@ -60,7 +60,7 @@ def run_cycles(
     """
     if not cycles:
         return
-    scene_counts = _stored(CycleTask(part, hulls, spec), directory, cycles, workers, executor)
+    scene_counts = _stored(CycleTask(part, solids, spec), directory, cycles, workers, executor)
     if not progress:
         for _ in scene_counts:
             pass

@@ -7,8 +7,9 @@ with them parts rest 0.2-0.3 % of D inside each other, other solvers and 10 line
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
-from attentionvote.part import Part
+from attentionvote.part import Part, Parts
 from attentionvote.simulation.decomposition import Hulls
 
 # The bin of the IPA-like protocol, for slender parts of 143 mm.
@@ -49,16 +50,17 @@ class BinSettings:
         if not 0 <= self.jitter <= 0.5:
             raise ValueError(f"bin jitter must lie in 0..0.5, got {self.jitter}")
 
-    def scaling_diameter(self, part: Part, count: int) -> float:
+    def scaling_diameter(self, parts: Parts, count: int) -> float:
         """The diameter in metres, relative to 143 mm, that bin and camera distance scale with.
 
-        It is D, or more for bulky parts, of which ``count`` would not fit into a bin scaled with D; with a given bin
-        size, the diameter that belongs to its length.
+        It is D of the largest part, or more for bulky parts, of which ``count`` would not fit into a bin scaled with D;
+        with a given bin size, the diameter that belongs to its length.
         """
         if self.size is not None:
             return self.size[0] / REFERENCE_BIN[0] * REFERENCE_DIAMETER
-        fill = count * ConvexHull(part.vertices).volume / np.prod(REFERENCE_BIN)
-        return max(part.diameter, float(REFERENCE_DIAMETER * (fill / _LARGEST_FILL) ** (1 / 3)))
+        volume = np.mean([ConvexHull(part.vertices).volume for part in parts.parts])
+        fill = count * volume / np.prod(REFERENCE_BIN)
+        return max(parts.diameter, float(REFERENCE_DIAMETER * (fill / _LARGEST_FILL) ** (1 / 3)))
 
     def sample(self, diameter: float, rng: np.random.Generator) -> NDArray[np.float64]:
         """``(3,)`` inner size in metres for one cycle, ``diameter`` from :meth:`scaling_diameter`."""
@@ -112,25 +114,30 @@ class Pile:
     speed: float
 
 
+class Solid(NamedTuple):
+    """A part as the physics sees it: ``hulls`` are its convex pieces (``decomposition.convex_hulls``)."""
+
+    part: Part
+    hulls: Hulls
+
+
 def drop_parts(
-    part: Part,
-    hulls: Hulls,
-    count: int,
+    solids: Sequence[Solid],
+    part_ids: NDArray[np.int32],
     bin_size: NDArray[np.float64],
     friction: float,
     settings: DropSettings,
     rng: np.random.Generator,
 ) -> Iterator[Pile]:
-    """Drop up to ``count`` parts in sequence and yield every pile that came to rest.
+    """Drop parts in sequence and yield every pile that came to rest.
 
     The bin's walls go on invisibly above the rim, as infinite planes: nothing falls out or tunnels through.
     A pile that still moves (> 5 cm/s) after the timeout is left out. The cycle ends early when a part rests above the
     rim (the bin is full), left the bin, or any value is not finite.
 
     Args:
-        part: the part; its true surface gives mass and inertia.
-        hulls: its convex pieces (:func:`~attentionvote.simulation.decomposition.convex_hulls`).
-        count: most parts to drop.
+        solids: the parts; their true surfaces give mass and inertia.
+        part_ids: ``(count,)`` which of them each drop is.
         bin_size: ``(3,)`` inner length, width, height in metres.
         friction: sliding friction coefficient of every surface.
         settings: physics settings.
@@ -139,14 +146,16 @@ def drop_parts(
     Yields:
         One :class:`Pile` per accepted drop; its number of parts tells which drop it was.
     """
-    mass, centre, inertia = _mass_properties(part)
-    model = _build_model(hulls, count, bin_size, friction, settings, part.diameter, mass, centre, inertia)
+    count = len(part_ids)
+    masses = [_mass_properties(solid.part) for solid in solids]
+    model = _build_model(solids, masses, part_ids, bin_size, friction, settings)
     data = mujoco.MjData(model)
-    vertices = np.concatenate(hulls)
+    vertices = [np.concatenate(solid.hulls) for solid in solids]
     half = np.asarray(bin_size[:2]) / 2
     pile_top = 0.0
-    for k in range(count):
-        _release(model, data, k, vertices, half, pile_top + 0.3 * part.diameter, settings.speed, rng)
+    for k, kind in enumerate(part_ids):
+        height = pile_top + 0.3 * solids[kind].part.diameter
+        _release(model, data, k, vertices[kind], half, height, settings.speed, rng)
         speed = _settle(model, data, k + 1, settings)
         pose = data.qpos.reshape(count, 7)[: k + 1]
         if (
@@ -156,10 +165,16 @@ def drop_parts(
         ):
             return
         bin_from_part = transform(matrix_from_quaternion(pose[:, 3:]), pose[:, :3])
-        centres = apply(bin_from_part, centre[None])[:, 0]
-        if (np.abs(centres[:, :2]) > half).any() or (centres[:, 2] < 0).any() or (centres[:, 2] > bin_size[2]).any():
-            return
-        pile_top = max(0.0, float(apply(bin_from_part, vertices)[..., 2].max()))
+        pile_top = 0.0
+        for i, (_, centre, _) in enumerate(masses):
+            own = bin_from_part[part_ids[: k + 1] == i]
+            if not len(own):
+                continue
+            centres = apply(own, centre[None])[:, 0]
+            outside = np.abs(centres[:, :2]) > half
+            if outside.any() or (centres[:, 2] < 0).any() or (centres[:, 2] > bin_size[2]).any():
+                return
+            pile_top = max(pile_top, float(apply(own, vertices[i])[..., 2].max()))
         if speed <= 0.05:
             yield Pile(bin_from_part, speed)
 
@@ -200,30 +215,36 @@ def _settle(model: mujoco.MjModel, data: mujoco.MjData, dropped: int, settings: 
             return float(linear)
 
 
-def _mass_properties(part: Part) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Mass (kg), centre ``(3,)`` (m) and inertia ``(3, 3)`` about it, of the solid; of its hull if it is not closed."""
+class _Mass(NamedTuple):
+    """Mass in kg, centre ``(3,)`` in metres and inertia ``(3, 3)`` about it in the part frame."""
+
+    mass: float
+    centre: NDArray[np.float64]
+    inertia: NDArray[np.float64]
+
+
+def _mass_properties(part: Part) -> _Mass:
+    """Those of the solid; of its hull if it is not closed."""
     import trimesh
 
     mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
     if not mesh.is_watertight or mesh.volume <= 0:
         mesh = mesh.convex_hull
     mesh.density = _DENSITY
-    return float(mesh.mass), np.array(mesh.center_mass), np.array(mesh.moment_inertia)
+    return _Mass(float(mesh.mass), np.array(mesh.center_mass), np.array(mesh.moment_inertia))
 
 
 def _build_model(
-    hulls: Hulls,
-    count: int,
+    solids: Sequence[Solid],
+    masses: Sequence[_Mass],
+    part_ids: NDArray[np.int32],
     bin_size: NDArray[np.float64],
     friction: float,
     settings: DropSettings,
-    diameter: float,
-    mass: float,
-    centre: NDArray[np.float64],
-    inertia: NDArray[np.float64],
 ) -> mujoco.MjModel:
     """A model with every part of the cycle, parked above the bin without weight until its drop."""
-    scale = 0.5 if diameter < _SMALL_DIAMETER else 1.0
+    diameters = [solid.part.diameter for solid in solids]
+    scale = 0.5 if min(diameters) < _SMALL_DIAMETER else 1.0
     spec = mujoco.MjSpec()
     spec.memory = 256 << 20  # the contact arena; reserved, not touched, until it is needed
     option = spec.option
@@ -253,20 +274,23 @@ def _build_model(
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_PLANE, pos=position, quat=quaternion, size=[0, 0, 1], **surface
         )
-    for i, hull in enumerate(hulls):
-        spec.add_mesh(name=f"hull_{i}", uservert=hull.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-    full = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
-    for k in range(count):
+    for kind in np.unique(part_ids):
+        for i, hull in enumerate(solids[kind].hulls):
+            spec.add_mesh(
+                name=f"hull_{kind}_{i}", uservert=hull.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            )
+    for k, kind in enumerate(part_ids):
+        mass, centre, inertia = masses[kind]
         body = spec.worldbody.add_body(
             name=f"part_{k}",
-            pos=[0, 0, 10.0 + 2 * diameter * k],
+            pos=[0, 0, 10.0 + 2 * max(diameters) * k],
             gravcomp=1.0,
             explicitinertial=True,
             mass=mass,
             ipos=centre,
-            fullinertia=full,
+            fullinertia=[inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]],
         )
         body.add_freejoint()
-        for i in range(len(hulls)):
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull_{i}", **surface)
+        for i in range(len(solids[kind].hulls)):
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"hull_{kind}_{i}", **surface)
     return spec.compile()

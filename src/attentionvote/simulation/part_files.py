@@ -1,4 +1,4 @@
-"""Parts by name: a built-in of the catalogue, or the user's mesh file."""
+"""Parts by name: a built-in of the catalogue, or the user's mesh file; and sets of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.part import Part
+from attentionvote.part import Part, PartSet
 from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
 from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
 
@@ -59,6 +59,46 @@ def load_part(
         )
     vertices, faces = load_surface(mesh, units)
     return Part(name, vertices, faces, diameter or largest_vertex_distance(vertices), group or Symmetry(), title)
+
+
+def load_parts(
+    name: str,
+    parts: Mapping[str, Part | Mapping[str, Any]],
+    title: str = "",
+    base_radius: float | None = None,
+    voxel_size: float | None = None,
+) -> PartSet:
+    """The set of parts in one bin that ``conf/object/NAME.yaml`` describes.
+
+    Args:
+        name: stem of the configuration file.
+        parts: by name the arguments of ``load_part`` (keys that begin with ``_`` are Hydra's), or parts that are loaded
+            already, in the order of the network's classes; at least two.
+        title: one line for people.
+        base_radius, voxel_size: as in ``load_part``; left out, derived from D of the largest part.
+
+    Raises:
+        ValueError: with one sentence, on too few parts, settings that describe none, or two that cannot be told apart.
+        FileNotFoundError: as ``load_part``.
+    """
+    if not isinstance(parts, Mapping) or len(parts) < 2:
+        given = ", ".join(map(str, parts)) if isinstance(parts, Mapping) else repr(parts)
+        raise ValueError(f"{name}: parts must be at least two parts by name, got {given or 'none'}")
+    for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size)):
+        if value is not None and not 0 < value < 10:
+            raise ValueError(f"{name}: {key} must be positive metres (below 10) or null, got {value}")
+    return PartSet(name, tuple(_member(name, key, settings) for key, settings in parts.items()), title)
+
+
+def _member(name: str, key: str, settings: Part | Mapping[str, Any]) -> Part:
+    if isinstance(settings, Part):
+        return settings
+    try:
+        return load_part(**{k: v for k, v in settings.items() if not k.startswith("_")})
+    except (TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{name}: parts.{key} must be the settings of one part, as in conf/object, got {settings!r}"
+        ) from error
 
 
 def _symmetry(name: str, symmetry: Mapping[str, Any] | Symmetry | None) -> Symmetry | None:

@@ -1,4 +1,4 @@
-"""Exact ray casting of a pile: one BVH per part, rays moved into the part's frame for every instance.
+"""Exact ray casting of a pile: one BVH per kind of part, rays moved into the part's frame for every instance.
 
 embreex has no instancing; rebuilding a BVH per scene grows with the mesh, this does not. Rays pass through points
 ``(x, y, 1)``, unnormalised, so that a hit's ray parameter is its depth z.
@@ -7,13 +7,14 @@ embreex has no instancing; rebuilding a BVH per scene grows with the mesh, this 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply, inverse
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -69,24 +70,48 @@ class BinSurface:
         return BinSurface(self.size, pose)
 
 
-class PartCaster:
-    """Casts rays at instances of one part. Build one per process; it holds the part's BVH."""
+class _Surface(NamedTuple):
+    """A part as rays meet it: corners ``(V, 3)`` of its hull, embree's scene and mesh."""
 
-    def __init__(self, part: Part) -> None:
+    outline: Floats
+    scene: Any
+    mesh: Any  # embree only points at it
+
+
+class PartCaster:
+    """Casts rays at instances of one part, or of a set. Build one per process; it holds the parts' BVHs.
+
+    Which part an instance is stands in ``part_ids`` ``(I,)``; left out, all are the first.
+    """
+
+    def __init__(self, part: Parts) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
         self.part = part
-        triangles = part.vertices[part.faces]
-        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        self._normals = normals / np.where(length > 0, length, 1.0)
-        self._outline = part.vertices[ConvexHull(part.vertices).vertices]
-        self._scene = EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, triangles.astype(np.float32))
+        self._surfaces: list[_Surface] = []
+        normals = []
+        for one in part.parts:
+            triangles = one.vertices[one.faces]
+            normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+            length = np.linalg.norm(normal, axis=1, keepdims=True)
+            normals.append(normal / np.where(length > 0, length, 1.0))
+            scene = EmbreeScene()
+            mesh = TriangleMesh(scene, triangles.astype(np.float32))
+            outline = one.vertices[ConvexHull(one.vertices).vertices]
+            self._surfaces.append(_Surface(outline, scene, mesh))
+        self._normals = np.concatenate(normals)
+        self._first_face = np.cumsum([0, *(len(normal) for normal in normals[:-1])])
+        # Parts rest a fraction of a millimetre inside floor and walls: such points still belong to the part.
+        self._sunk = np.array([0.005 * one.diameter for one in part.parts])
 
     def cast(
-        self, camera_from_part: Floats, xy: Floats, surface: BinSurface | None = None, background: bool = True
+        self,
+        camera_from_part: Floats,
+        xy: Floats,
+        surface: BinSurface | None = None,
+        part_ids: NDArray[np.int32] | None = None,
+        background: bool = True,
     ) -> Hits:
         """First hits of rays from the origin through ``xy`` ``(P, 2)`` on the plane z = 1.
 
@@ -94,6 +119,7 @@ class PartCaster:
             camera_from_part: ``(I, 4, 4)`` poses; every instance must lie in front of the origin (z > 0).
             xy: rays.
             surface: the bin, or None for none.
+            part_ids: ``(I,)`` which part each instance is.
             background: also compute the bin's depth along rays that meet no instance; inf there otherwise.
 
         Raises:
@@ -107,12 +133,13 @@ class PartCaster:
         nearest = np.full(len(xy), np.inf, dtype=np.float32)
         owner = np.full(len(xy), -1, dtype=np.int32)
         face = np.zeros(len(xy), dtype=np.int32)
-        low, high = self._outline_boxes(camera_from_part)
+        kinds = _kinds(part_ids, len(camera_from_part))
+        low, high = self._outline_boxes(camera_from_part, kinds)
         first, last = np.searchsorted(x, low[:, 0], "left"), np.searchsorted(x, high[:, 0], "right")
         for i, pose in enumerate(camera_from_part):
             inside = y[first[i] : last[i]]
             chosen = np.flatnonzero((inside >= low[i, 1]) & (inside <= high[i, 1])) + first[i]
-            t, primitive = self._cast_one(pose, rays[chosen])
+            t, primitive = self._cast_one(kinds[i], pose, rays[chosen])
             closer = (primitive >= 0) & (t < nearest[chosen])
             chosen = chosen[closer]
             nearest[chosen], owner[chosen], face[chosen] = t[closer], i, primitive[closer]
@@ -125,23 +152,36 @@ class PartCaster:
             wanted = slice(None) if background else ray
             wall[wanted] = surface.depth(xy[wanted])
             depth[:] = wall
-            # Parts rest a fraction of a millimetre inside floor and walls: such points still belong to the part.
-            front = t < wall[ray] + 0.005 * self.part.diameter
+            front = t < wall[ray] + self._sunk[kinds[owner]]
             ray, t, owner, face = ray[front], t[front], owner[front], face[front]
         depth[ray], instance[ray] = t, owner
-        turned = np.einsum("pij,pj->pi", camera_from_part[owner, :3, :3], self._normals[face])
+        turned = np.einsum(
+            "pij,pj->pi", camera_from_part[owner, :3, :3], self._normals[self._first_face[kinds[owner]] + face]
+        )
         # A closed surface shows its outside; only open ones need the sign.
         away = np.einsum("pi,pi->p", turned[:, :2], xy[ray]) + turned[:, 2] > 0
         normal[ray] = np.where(away[:, None], -turned, turned)
         return Hits(depth, instance, normal)
 
-    def blocked(self, camera_from_part: Floats, points: Floats, margin: float, surface: BinSurface | None) -> NDArray:
+    def blocked(
+        self,
+        camera_from_part: Floats,
+        points: Floats,
+        margin: float,
+        surface: BinSurface | None,
+        part_ids: NDArray[np.int32] | None = None,
+    ) -> NDArray:
         """``(P,)`` bool: the ray to ``points`` ``(P, 3)`` ends more than ``margin`` metres before them."""
-        depth = self.cast(camera_from_part, points[:, :2] / points[:, 2:], surface).depth
+        depth = self.cast(camera_from_part, points[:, :2] / points[:, 2:], surface, part_ids).depth
         return depth < points[:, 2] - margin
 
     def visible_fraction(
-        self, camera_from_part: Floats, camera: Camera, surface: BinSurface | None, stride: int = 2
+        self,
+        camera_from_part: Floats,
+        camera: Camera,
+        surface: BinSurface | None,
+        stride: int = 2,
+        part_ids: NDArray[np.int32] | None = None,
     ) -> Floats:
         """``(I,)`` share of every instance's own silhouette that the camera sees, from every ``stride``-th pixel.
 
@@ -149,7 +189,8 @@ class PartCaster:
         Stride 2 is within 0.003 of every pixel, stride 4 within 0.01.
         """
         count = len(camera_from_part)
-        low, high = self._outline_boxes(camera_from_part)
+        kinds = _kinds(part_ids, count)
+        low, high = self._outline_boxes(camera_from_part, kinds)
         centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
         size = np.array([camera.width, camera.height])
         first = np.ceil((low * focal + centre) / stride).astype(int)
@@ -164,7 +205,7 @@ class PartCaster:
             pixels = np.stack([u.ravel(), v.ravel()], axis=1)
             rays = np.ones((len(pixels), 3), dtype=np.float32)
             rays[:, :2] = camera.rays(pixels * stride)
-            t, face = self._cast_one(pose, rays)
+            t, face = self._cast_one(kinds[i], pose, rays)
             hit = face >= 0
             silhouette[i] = hit.sum()
             row, column = (pixels[hit] - origin).T[::-1]
@@ -175,13 +216,16 @@ class PartCaster:
         pixels = (np.stack([column, row], axis=1) + origin) * stride
         seen = ((pixels >= 0) & (pixels < size)).all(axis=1)
         if surface is not None:
-            seen &= nearest[row, column] < surface.depth(camera.rays(pixels)) + 0.005 * self.part.diameter
+            sunk = self._sunk[kinds[owner[row, column]]]
+            seen &= nearest[row, column] < surface.depth(camera.rays(pixels)) + sunk
         visible = np.bincount(owner[row, column][seen], minlength=count)
         return visible / np.maximum(silhouette, 1)
 
-    def pixel_box(self, camera_from_part: Floats, camera: Camera) -> tuple[int, int, int, int]:
+    def pixel_box(
+        self, camera_from_part: Floats, camera: Camera, part_ids: NDArray[np.int32] | None = None
+    ) -> tuple[int, int, int, int]:
         """First and last column and row, ``(u0, u1, v0, v1)`` inclusive, of the picture's part that holds the pile."""
-        low, high = self._outline_boxes(camera_from_part)
+        low, high = self._outline_boxes(camera_from_part, _kinds(part_ids, len(camera_from_part)))
         centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
         u0, v0 = np.maximum(np.ceil(low.min(axis=0) * focal + centre), 0).astype(int)
         u1, v1 = np.minimum(np.floor(high.max(axis=0) * focal + centre), (camera.width - 1, camera.height - 1)).astype(
@@ -189,15 +233,21 @@ class PartCaster:
         )
         return int(u0), int(u1), int(v0), int(v1)
 
-    def _outline_boxes(self, camera_from_part: Floats) -> tuple[Floats, Floats]:
+    def _outline_boxes(self, camera_from_part: Floats, kinds: NDArray[np.int32]) -> tuple[Floats, Floats]:
         """Bounds ``(I, 2)``, ``(I, 2)`` of the instances' projections on the plane z = 1."""
-        outline = apply(camera_from_part, self._outline)
-        if len(outline) and outline[..., 2].min() <= 0:
-            raise ValueError(f"{self.part.name}: every instance must lie in front of the camera, one reaches z <= 0")
-        projected = outline[..., :2] / outline[..., 2:]
-        return projected.min(axis=1) - 1e-9, projected.max(axis=1) + 1e-9
+        low, high = np.empty((len(kinds), 2)), np.empty((len(kinds), 2))
+        for kind, part in enumerate(self.part.parts):
+            own = kinds == kind
+            outline = apply(camera_from_part[own], self._surfaces[kind].outline)
+            if len(outline) and outline[..., 2].min() <= 0:
+                raise ValueError(f"{part.name}: every instance must lie in front of the camera, one reaches z <= 0")
+            projected = outline[..., :2] / outline[..., 2:]
+            low[own], high[own] = projected.min(axis=1) - 1e-9, projected.max(axis=1) + 1e-9
+        return low, high
 
-    def _cast_one(self, pose: Floats, rays: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def _cast_one(
+        self, kind: int, pose: Floats, rays: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays ``(P, 3)`` (x, y, 1) at one instance alone."""
         if not len(rays):
             return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int32)
@@ -205,5 +255,9 @@ class PartCaster:
         direction = rays @ part_from_camera[:3, :3].T.astype(np.float32)
         origin = np.empty_like(direction)
         origin[:] = part_from_camera[:3, 3]
-        out = self._scene.run(origin, direction, output=1)
+        out = self._surfaces[kind].scene.run(origin, direction, output=1)
         return out["tfar"], out["primID"]
+
+
+def _kinds(part_ids: NDArray[np.int32] | None, count: int) -> NDArray[np.int32]:
+    return np.zeros(count, dtype=np.int32) if part_ids is None else part_ids

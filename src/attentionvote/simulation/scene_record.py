@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -30,6 +30,7 @@ class SceneRecord:
         bin_size: ``(3,)`` inner length, width, height in metres.
         friction: sliding friction coefficient of the cycle.
         scene_seed: seed for whatever is drawn anew for the scene (evaluation clouds, for example).
+        part_ids: ``(I,)`` int32 which part of the bin's set each instance is; left out, all are the first.
     """
 
     cycle: int
@@ -41,6 +42,11 @@ class SceneRecord:
     bin_size: NDArray[np.float64]
     friction: float
     scene_seed: int
+    part_ids: NDArray[np.int32] = field(default=None)  # type: ignore[arg-type]  # None only until it is filled in
+
+    def __post_init__(self) -> None:
+        if self.part_ids is None:
+            object.__setattr__(self, "part_ids", np.zeros(len(self.camera_from_part), dtype=np.int32))
 
     @property
     def bin_surface(self) -> BinSurface:
@@ -69,6 +75,9 @@ def save_records(path: Path, records: Sequence[SceneRecord]) -> None:
         "camera_from_part": _pack(np.concatenate([np.zeros((0, 4, 4)), *(r.camera_from_part for r in records)])),
         "visible_fraction": np.concatenate([np.zeros(0), *(r.visible_fraction for r in records)]),
     }
+    part_ids = np.concatenate([np.zeros(0, dtype=np.int32), *(r.part_ids for r in records)])
+    if part_ids.any():  # what holds one part only looks as it always did
+        fields["part_ids"] = part_ids
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     with temporary.open("wb") as file:
         np.savez(file, **fields)  # type: ignore[arg-type]
@@ -87,6 +96,8 @@ def load_records(path: Path) -> list[SceneRecord]:
         borders = np.cumsum(f["drop_count"])[:-1]
         poses = np.split(_unpack(f["camera_from_part"]), borders)
         visible = np.split(f["visible_fraction"], borders)
+        part_ids = f.get("part_ids", np.zeros(len(f["visible_fraction"]), dtype=np.int32))
+        kinds = np.split(part_ids.astype(np.int32), borders)
         cameras_from_bin = _unpack(f["camera_from_bin"])
         return [
             SceneRecord(
@@ -99,6 +110,7 @@ def load_records(path: Path) -> list[SceneRecord]:
                 bin_size=f["bin_size"][i],
                 friction=float(f["friction"][i]),
                 scene_seed=int(f["scene_seed"][i]),
+                part_ids=kinds[i],
             )
             for i in range(len(f["cycle"]))
         ]

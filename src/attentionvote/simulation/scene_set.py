@@ -19,11 +19,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from attentionvote.execution import Executor
-from attentionvote.part import Part
-from attentionvote.simulation.decomposition import Hulls, convex_hulls
-from attentionvote.simulation.drop import drop_parts
+from attentionvote.part import Parts
+from attentionvote.simulation.decomposition import convex_hulls
+from attentionvote.simulation.drop import DropSettings, Solid, drop_parts
 from attentionvote.simulation.raycast import BinSurface, PartCaster
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
@@ -82,43 +83,67 @@ class SceneSet:
         return iter(self.records)
 
 
-def simulate_cycle(part: Part, hulls: Hulls, caster: PartCaster, spec: SceneSetSpec, cycle: int) -> list[SceneRecord]:
-    """The scenes of one drop cycle; a pure function of its arguments."""
-    physics_seed, *scene_seeds = spec.cycle_seed(cycle).spawn(1 + len(spec.drop_counts))
+def draw_part_ids(parts: int, count: int, rng: np.random.Generator) -> NDArray[np.int32]:
+    """``(count,)`` which of ``parts`` each drop is: every part once, in random order, then any, so that a pile of at
+    least as many drops as parts holds all of them ("objects including all categories", paper section 4.1)."""
+    return np.concatenate([rng.permutation(parts), rng.integers(parts, size=count)])[:count].astype(np.int32)
+
+
+def simulate_cycle(
+    part: Parts, solids: Sequence[Solid], caster: PartCaster, spec: SceneSetSpec, cycle: int
+) -> list[SceneRecord]:
+    """The scenes of one drop cycle; a pure function of its arguments.
+
+    Args:
+        part: what lies in the bin.
+        solids: of its parts, in their order.
+        caster: of the same.
+        spec: of the set.
+        cycle: which one.
+    """
+    most = spec.drop_counts[-1]
+    physics_seed, *scene_seeds, parts_seed = spec.cycle_seed(cycle).spawn(2 + len(spec.drop_counts))
+    part_ids = draw_part_ids(len(solids), most, np.random.default_rng(parts_seed))
     rng = np.random.default_rng(physics_seed)
-    scale = spec.bin.scaling_diameter(part, spec.drop_counts[-1])
+    scale = spec.bin.scaling_diameter(part, most)
     bin_size = spec.bin.sample(scale, rng)
     friction = float(rng.uniform(*spec.drop.friction))
     seeds = dict(zip(spec.drop_counts, scene_seeds, strict=True))
     records = []
-    for pile in drop_parts(part, hulls, spec.drop_counts[-1], bin_size, friction, spec.drop, rng):
+    for pile in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng):
         count = len(pile.bin_from_part)
         if count not in seeds:
             continue
         scene_rng = np.random.default_rng(seeds[count])
         camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
         camera_from_part = camera_from_bin @ pile.bin_from_part
-        surface = BinSurface(bin_size, camera_from_bin)
+        surface, own_ids = BinSurface(bin_size, camera_from_bin), part_ids[:count]
         records.append(
             SceneRecord(
                 cycle=cycle,
                 drop_count=count,
                 camera_from_part=camera_from_part,
                 visible_fraction=caster.visible_fraction(
-                    camera_from_part, spec.camera.camera, surface, spec.visibility_stride
+                    camera_from_part, spec.camera.camera, surface, spec.visibility_stride, own_ids
                 ),
                 camera=spec.camera.camera,
                 camera_from_bin=camera_from_bin,
                 bin_size=bin_size,
                 friction=friction,
                 scene_seed=int(scene_rng.integers(2**63)),
+                part_ids=own_ids,
             )
         )
     return records
 
 
+def solids_of(part: Parts, settings: DropSettings) -> list[Solid]:
+    """The parts with their convex pieces."""
+    return [Solid(one, convex_hulls(one, settings.hull_threshold, settings.hull_vertices)) for one in part.parts]
+
+
 def generate_scene_set(
-    part: Part,
+    part: Parts,
     spec: SceneSetSpec,
     directory: Path,
     workers: int = 1,
@@ -128,7 +153,7 @@ def generate_scene_set(
     """Generate what is missing of a scene set and open it; does nothing when it is complete.
 
     Args:
-        part: the part; its digest must be the specification's.
+        part: the part or set of parts; its digest must be the specification's.
         spec: what to generate.
         directory: the set's own directory, created when missing; a second process waits for the first.
         workers: processes; the result does not depend on it.
@@ -162,11 +187,11 @@ def generate_scene_set(
                 leftover.unlink()  # temporary files of a killed process; the lock says nobody writes now
             if manifest is None:
                 _write_manifest(directory, part, spec, None)
-            hulls = _frozen_hulls(part, spec, directory)
+            solids = _frozen_solids(part, spec, directory)
             missing = [c for c in range(spec.cycles) if not _shard(directory, c).is_file()]
             title = f"{part.name}, {spec.split} scenes"
             done = spec.cycles - len(missing)
-            run_cycles(part, hulls, spec, directory, missing, workers, progress, title, done, executor)
+            run_cycles(part, solids, spec, directory, missing, workers, progress, title, done, executor)
             _write_manifest(directory, part, spec, content_digest(directory, spec.cycles))
     return SceneSet.open(directory)
 
@@ -188,6 +213,8 @@ def content_digest(directory: Path, cycles: int) -> str:
                 (r.visible_fraction, 1e4),
             ):
                 h.update(np.round(values * scale).astype("<i8").tobytes())
+            if r.part_ids.any():
+                h.update(r.part_ids.astype("<i4").tobytes())
     return h.hexdigest()
 
 
@@ -200,16 +227,29 @@ def _shard(directory: Path, cycle: int) -> Path:
     return directory / "cycles" / f"{cycle:05d}.npz"
 
 
-def _frozen_hulls(part: Part, spec: SceneSetSpec, directory: Path) -> Hulls:
+def _frozen_solids(part: Parts, spec: SceneSetSpec, directory: Path) -> list[Solid]:
     path = directory / "hulls.npz"
     if not path.is_file():
-        hulls = convex_hulls(part, spec.drop.hull_threshold, spec.drop.hull_vertices)
+        pieces = {
+            name: hull
+            for kind, solid in enumerate(solids_of(part, spec.drop))
+            for name, hull in zip(_piece_names(kind, len(solid.hulls)), solid.hulls, strict=True)
+        }
         temporary = directory / f".hulls.npz.{os.getpid()}"
         with temporary.open("wb") as file:
-            np.savez(file, *hulls)
+            np.savez(file, **pieces)  # type: ignore[arg-type]
         temporary.replace(path)
     with np.load(path) as stored:
-        return tuple(stored[f"arr_{i}"] for i in range(len(stored.files)))
+        names = [
+            [name for name in _piece_names(kind, len(stored.files)) if name in stored.files]
+            for kind in range(len(part.parts))
+        ]
+        return [Solid(one, tuple(stored[name] for name in own)) for one, own in zip(part.parts, names, strict=True)]
+
+
+def _piece_names(kind: int, count: int) -> list[str]:
+    """Names of a part's convex pieces in the file; the first part's are what numpy calls them."""
+    return [f"arr_{i}" if kind == 0 else f"part_{kind}_{i}" for i in range(count)]
 
 
 def _read_manifest(directory: Path) -> dict | None:
@@ -223,7 +263,7 @@ def _read_manifest(directory: Path) -> dict | None:
         raise ValueError(f"{path} must be the manifest of a scene set, but it cannot be read: {error!r}") from error
 
 
-def _write_manifest(directory: Path, part: Part, spec: SceneSetSpec, content: str | None) -> None:
+def _write_manifest(directory: Path, part: Parts, spec: SceneSetSpec, content: str | None) -> None:
     manifest = {
         "part": part.name,
         "spec": spec.as_dict(),

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop import BinSettings, DropSettings
 
@@ -23,7 +23,7 @@ class SceneSetSpec:
     """Everything that determines the content of a scene set.
 
     Args:
-        part_digest: ``Part.digest``.
+        part_digest: of the part, or of the set of parts.
         split: name of the split; it enters the seeds, so splits never share a cycle.
         cycles: number of drop cycles.
         seed: any non-negative integer.
@@ -79,11 +79,11 @@ def scene_set_directory(root: Path, part_name: str, spec: SceneSetSpec) -> Path:
     return root / part_name / f"{spec.split}-{spec.digest()[:12]}"
 
 
-def scene_set_specs(part: Part, settings: Mapping[str, Any]) -> dict[str, SceneSetSpec]:
+def scene_set_specs(part: Parts, settings: Mapping[str, Any]) -> dict[str, SceneSetSpec]:
     """Specification of every split, from the plain values of ``conf/simulation/*.yaml``.
 
     Args:
-        part: the part.
+        part: the part, or the set of parts in the bin.
         settings: ``cycles`` (split name -> number of cycles), ``seed``, ``drop_counts``, ``visibility_stride`` and the
             sections ``bin``, ``camera`` (with ``camera.camera``, the intrinsics) and ``drop``.
 

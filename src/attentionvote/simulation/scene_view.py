@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.geometry.pose import apply
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.scene import Scene
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
@@ -30,11 +30,11 @@ def instance_colours(count: int) -> NDArray[np.float64]:
     ).reshape(-1, 3)
 
 
-def scene_figure(part: Part, record: SceneRecord, scene: Scene, max_shown: int = 20000) -> Any:
+def scene_figure(part: Parts, record: SceneRecord, scene: Scene, max_shown: int = 20000) -> Any:
     """Plotly figure of a scene in the camera frame (metres): points by instance, posed meshes, bin, part axes.
 
     Args:
-        part: the part.
+        part: the part, or the set of parts in the bin.
         record: where the parts are.
         scene: what the sensor saw of it.
         max_shown: most points shown; a browser is slow beyond.
@@ -43,26 +43,31 @@ def scene_figure(part: Part, record: SceneRecord, scene: Scene, max_shown: int =
 
     colours = [f"rgb({r},{g},{b})" for r, g, b in (instance_colours(len(record.camera_from_part)) * 255).astype(int)]
     points, ids = scene.points[:max_shown], scene.instance_ids[:max_shown]
+    several = len(part.parts) > 1
+    names = [f"{part.parts[kind].title or part.parts[kind].name}, " if several else "" for kind in record.part_ids]
     figure = go.Figure()
     figure.add_trace(
         go.Scatter3d(
             **_columns(points),
             mode="markers",
             marker={"size": 1.6, "color": [colours[i] for i in ids]},
-            text=[f"instance {i}, visible {record.visible_fraction[i]:.0%}" for i in ids],
+            text=[f"{names[i]}instance {i}, visible {record.visible_fraction[i]:.0%}" for i in ids],
             hoverinfo="text",
             name=f"points ({len(points):,} of {len(scene.points):,})",
         )
     )
-    vertices = np.concatenate([apply(pose, part.vertices) for pose in record.camera_from_part])
-    faces = np.concatenate([part.faces + i * len(part.vertices) for i in range(len(record.camera_from_part))])
+    kinds = [part.parts[kind] for kind in record.part_ids]
+    posed = [apply(pose, kind.vertices) for pose, kind in zip(record.camera_from_part, kinds, strict=True)]
+    first = np.cumsum([0, *(len(own) for own in posed)])
+    vertices = np.concatenate(posed)
+    faces = np.concatenate([kind.faces + start for kind, start in zip(kinds, first, strict=False)])
     figure.add_trace(
         go.Mesh3d(
             **_columns(np.round(vertices, 5)),
             i=faces[:, 0],
             j=faces[:, 1],
             k=faces[:, 2],
-            facecolor=np.repeat(colours, len(part.faces)),
+            facecolor=np.repeat(colours, [len(kind.faces) for kind in kinds]),
             flatshading=True,
             hoverinfo="skip",
             showlegend=True,
@@ -91,7 +96,7 @@ def scene_figure(part: Part, record: SceneRecord, scene: Scene, max_shown: int =
     return figure
 
 
-def write_view(directory: Path, part: Part, caster: PartCaster, record: SceneRecord, scene: Scene) -> dict[str, Path]:
+def write_view(directory: Path, part: Parts, caster: PartCaster, record: SceneRecord, scene: Scene) -> dict[str, Path]:
     """Write ``scene.html`` (self-contained), ``depth.png``, ``instances.png``, ``visibility.png``; their paths.
 
     The depth is the noise-free one of every pixel, bin included.
@@ -100,7 +105,7 @@ def write_view(directory: Path, part: Part, caster: PartCaster, record: SceneRec
     camera = record.camera
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     rays = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
-    hits = caster.cast(record.camera_from_part, rays, record.bin_surface)
+    hits = caster.cast(record.camera_from_part, rays, record.bin_surface, record.part_ids)
     depth = np.where(np.isfinite(hits.depth), hits.depth, np.nan).reshape(v.shape)
     colours = instance_colours(len(record.camera_from_part))
     owner = hits.instance.reshape(v.shape)

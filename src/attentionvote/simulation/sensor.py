@@ -85,7 +85,7 @@ def synthesize(
 
     Args:
         record: the stored scene.
-        caster: of the scene's part.
+        caster: of the part, or of the set of parts, in the scene.
         sensor: which effects to apply; noise is in the points, so normals estimated later see it.
         max_points: most points; fewer when the picture has no more.
         rng: decides pixels and noise.
@@ -100,7 +100,7 @@ def synthesize(
         raise ValueError(f"max_points must be at least 1, got {max_points}")
     poses, surface = record.camera_from_part, record.bin_surface
     scanner = _Scanner(record, caster, sensor, rng) if sensor.preset == "phoxi" else None
-    u0, u1, v0, v1 = caster.pixel_box(poses, record.camera)
+    u0, u1, v0, v1 = caster.pixel_box(poses, record.camera, record.part_ids)
     width, height = max(u1 - u0 + 1, 0), max(v1 - v0 + 1, 0)
     order = rng.permutation(np.arange(width * height, dtype=np.int32))
     points: list[Floats] = []
@@ -113,7 +113,7 @@ def synthesize(
         chosen = order[used : used + batch]
         used += len(chosen)
         pixels = np.stack([chosen % width + u0, chosen // width + v0], axis=1)
-        hits = caster.cast(poses, record.camera.rays(pixels), surface, background=False)
+        hits = caster.cast(poses, record.camera.rays(pixels), surface, record.part_ids, background=False)
         if scanner is not None:
             new_points, new_ids = scanner.measure(pixels, hits)
         else:
@@ -132,7 +132,7 @@ def synthesize(
         instance_ids=np.concatenate([np.zeros(0, dtype=np.int32), *ids])[:max_points],
         camera_from_part=poses,
         visible_fraction=record.visible_fraction,
-        part_ids=np.zeros(len(poses), dtype=np.int32),
+        part_ids=record.part_ids,
     )
 
 
@@ -160,7 +160,11 @@ class _Scanner:
         keep, points, cosine = keep[seen], points[seen], cosine[seen]
         # Margin: a point must not be shadowed by its own surface.
         shadow = self.caster.blocked(
-            self.poses_from_projector, points - self.projector, 5e-4 * self.scale, self.surface_from_projector
+            self.poses_from_projector,
+            points - self.projector,
+            5e-4 * self.scale,
+            self.surface_from_projector,
+            self.record.part_ids,
         )
         keep, points, cosine = keep[~shadow], points[~shadow], cosine[~shadow]
         z, lost_at_edge = self._edges(pixels[keep], points[:, 2])
@@ -190,7 +194,9 @@ class _Scanner:
         """Depth after flying pixels, and which points an edge swallows; looks at the four neighbouring pixels."""
         neighbours = (pixels[:, None] + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
         rays = self.record.camera.rays(neighbours)
-        depth = self.caster.cast(self.record.camera_from_part, rays, self.record.bin_surface).depth.reshape(-1, 4)
+        record = self.record
+        hits = self.caster.cast(record.camera_from_part, rays, record.bin_surface, record.part_ids)
+        depth = hits.depth.reshape(-1, 4)
         jump = np.abs(depth - z[:, None])
         edge = jump.max(axis=1, initial=0) > self.sensor.edge_jump * self.scale
         # A mixed measurement lies between this surface and the farthest-off neighbour that reflects at all.
