@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from hardware import cores
 from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.execution import Executor, executor_named
@@ -13,6 +16,16 @@ def executor_of(cfg: DictConfig) -> Executor:
     Raises:
         ValueError: when it cannot work here.
     """
+    return executor_named(cfg.executor, cluster_of(cfg))
+
+
+def cluster_of(cfg: DictConfig) -> dict[str, Any]:
+    """The settings of the group ``cluster``, plain."""
     settings = OmegaConf.to_container(cfg.cluster, resolve=True)
     assert isinstance(settings, dict)
-    return executor_named(cfg.executor, {str(key): value for key, value in settings.items()})
+    return {str(key): value for key, value in settings.items()}
+
+
+def cores_of_a_job(cfg: DictConfig, workers: int) -> int:
+    """Cores each of ``workers`` jobs at a time may use: ``threads``, else this machine's, shared by jobs of its own."""
+    return cfg.threads or max(1, cores() // (workers if cfg.executor == "local" else 1))

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from command import Refused, command, configuring
 from configuration import CONF, ConfigurationError, choices, compose, nearest, parse, sentence
-from hardware import cores
 from omegaconf import DictConfig, OmegaConf
-from train import preset_of_hardware
+from train import preset_of_workers
 
 if TYPE_CHECKING:
     from fleet_member import MemberTask
@@ -39,7 +38,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         words: it was composed of; those of the training are handed on to every part.
     """
     import fleet_board
-    from executors import executor_of
+    from executors import cores_of_a_job, executor_of
     from fleet_member import MemberTask
     from folder_lock import locked_folder
 
@@ -50,7 +49,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     for name, reason in left_out.items():
         log.warning("%s is left out: %s", name, reason)
     workers = cfg.workers or 1
-    threads = cfg.threads or max(1, cores() // (workers if cfg.executor == "local" else 1))
+    threads = cores_of_a_job(cfg, workers)
     folder = Path(cfg.fleets)
     here = cfg.executor == "local" and workers == 1
     own = () if here else (f"workers={threads}", f"trainer.threads={threads}")
@@ -79,18 +78,6 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         told = "; ".join(f"{name} failed, {reason}" for name, reason in failures.items())
         raise Refused(f"{len(failures)} of {len(rows)} parts are not done: {told}", result)
     return result
-
-
-def preset_of_workers(cfg: DictConfig, words: Sequence[str]) -> list[str]:
-    """The preset of the machines that train: of this one, or on a cluster what the jobs are given.
-
-    The machine that submits says nothing about those that train: a cluster's jobs have a GPU when they ask for one.
-    """
-    if cfg.executor == "local" or any(word.lstrip("+~").startswith("experiment") for word in words):
-        return preset_of_hardware(list(words))
-    preset = "gpu" if cfg.cluster.gpus > 0 else "compact"
-    log.info("experiment=%s, because cluster.gpus=%s (experiment=... chooses another)", preset, cfg.cluster.gpus)
-    return [f"experiment={preset}"]
 
 
 def training_words(words: Sequence[str]) -> list[str]:

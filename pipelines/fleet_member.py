@@ -20,10 +20,12 @@ class MemberTask:
     Args:
         words: of every verb.
         logs: folder for what the verbs say; None shows it here.
+        scripts: folder of the verbs.
     """
 
     words: dict[str, tuple[str, ...]]
     logs: Path | None
+    scripts: Path = SCRIPTS
 
     def __call__(self, name: str) -> dict[str, Any]:
         """What the verbs answered, by verb; ``failed`` names the verb that did not, ``sentence`` says why."""
@@ -40,7 +42,7 @@ class MemberTask:
         return answers | {"seconds": round(time.monotonic() - start, 1)}
 
     def _run(self, verb: str, words: list[str], name: str) -> Any:
-        script = SCRIPTS / f"{verb}.py"
+        script = self.scripts / f"{verb}.py"
         if self.logs is None:
             return JobProcess(script, words).wait()
         self.logs.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+_GPUS = Path("/proc/driver/nvidia/gpus")  # a folder for each that this machine, or this container, has
 
 
 def cores() -> int:
@@ -15,3 +18,26 @@ def cores() -> int:
     except (OSError, ValueError):  # no such file, or no quota ("max")
         pass
     return max(1, count)
+
+
+def visible_gpus(environment: Mapping[str, str], present: Path = _GPUS) -> list[str]:
+    """The GPUs that a process with this environment may use, as CUDA_VISIBLE_DEVICES names them; told without torch."""
+    said = environment.get("CUDA_VISIBLE_DEVICES")
+    if said is None:
+        return [str(index) for index in range(len(list(present.iterdir())))] if present.is_dir() else []
+    found: list[str] = []
+    for name in (entry.strip() for entry in said.split(",")):
+        if name in ("", "-1"):
+            break  # CUDA too sees none of what comes after the first that is no device
+        found.append(name)
+    return found
+
+
+def gpu_of_slot(gpus: Sequence[str], slot: int) -> dict[str, str]:
+    """The environment of the job in this slot among jobs side by side: each its own GPU, in turn where they are few.
+
+    Args:
+        gpus: see :func:`visible_gpus`; with fewer than two there is nothing to choose.
+        slot: from 0; no two jobs that run have the same.
+    """
+    return {"CUDA_VISIBLE_DEVICES": gpus[slot % len(gpus)]} if len(gpus) > 1 else {}

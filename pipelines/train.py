@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
@@ -49,6 +50,9 @@ def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
                     "this training is complete, made at commit %s (force=true repeats it): %s", commit, job.directory
                 )
             return result
+        from lightning_import import import_lightning
+
+        import_lightning()
         from training_run import TrainingRun
 
         with configuring():
@@ -85,6 +89,18 @@ def preset_of_hardware(words: list[str]) -> list[str]:
             preset, reason = "compact", "torch is a CPU build"
     if place.rank == 0:
         log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
+    return [f"experiment={preset}"]
+
+
+def preset_of_workers(cfg: DictConfig, words: Sequence[str]) -> list[str]:
+    """The preset of the machines that train: of this one, or on a cluster what the jobs are given.
+
+    The machine that submits says nothing about those that train: a cluster's jobs have a GPU when they ask for one.
+    """
+    if cfg.executor == "local" or any(word.lstrip("+~").startswith("experiment") for word in words):
+        return preset_of_hardware(list(words))
+    preset = "gpu" if cfg.cluster.gpus > 0 else "compact"
+    log.info("experiment=%s, because cluster.gpus=%s (experiment=... chooses another)", preset, cfg.cluster.gpus)
     return [f"experiment={preset}"]
 
 

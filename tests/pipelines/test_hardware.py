@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hardware import cores
+from hardware import cores, gpu_of_slot, visible_gpus
 
 
 def limited(monkeypatch: pytest.MonkeyPatch, allowed: int, quota: str | None) -> int:
@@ -31,3 +31,29 @@ def test_the_smaller_of_cpuset_and_quota_counts(
     monkeypatch: pytest.MonkeyPatch, allowed: int, quota: str | None, expected: int
 ) -> None:
     assert limited(monkeypatch, allowed, quota) == expected
+
+
+@pytest.mark.parametrize(
+    ("said", "there", "expected"),
+    [
+        (None, 0, []),
+        (None, 3, ["0", "1", "2"]),
+        ("2,5", 8, ["2", "5"]),
+        ("GPU-8a, MIG-7b", 8, ["GPU-8a", "MIG-7b"]),
+        ("1,-1,0", 8, ["1"]),
+        ("", 8, []),
+    ],
+)
+def test_the_gpus_of_a_machine_without_asking_torch(
+    tmp_path: Path, said: str | None, there: int, expected: list[str]
+) -> None:
+    for index in range(there):
+        (tmp_path / "gpus" / f"0000:{index:02x}:00.0").mkdir(parents=True)
+    environment = {} if said is None else {"CUDA_VISIBLE_DEVICES": said}
+    assert visible_gpus(environment, tmp_path / "gpus") == expected
+
+
+def test_jobs_side_by_side_have_gpus_of_their_own_as_long_as_there_are_some() -> None:
+    chosen = [gpu_of_slot(["2", "5", "7"], slot) for slot in range(5)]
+    assert [c["CUDA_VISIBLE_DEVICES"] for c in chosen] == ["2", "5", "7", "2", "5"]
+    assert gpu_of_slot(["2"], 1) == gpu_of_slot([], 1) == {}
