@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +54,7 @@ def make_pile(box: Part) -> Callable[..., Pile]:
     """A pile of ``count`` boxes (diameter 75 mm) at random poses above the middle of a bin; ``place`` shifts it."""
     caster = PartCaster(box)
 
+    @cache
     def make(
         count: int, seed: int = 0, camera: Camera = CAMERA, with_bin: bool = True, place: tuple[float, ...] = (0, 0, 0)
     ) -> Pile:

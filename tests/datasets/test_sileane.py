@@ -208,3 +208,20 @@ def test_apply_of_a_read_pose_lands_on_the_parts_own_points(folder: Path) -> Non
         local = (own - pose[:3, 3]) @ pose[:3, :3]
         np.testing.assert_allclose(apply(pose, local), own, atol=1e-12)
         assert (np.abs(local) <= half + 1e-5).all()  # on the box, in the box's own frame
+
+
+def test_poses_that_are_the_cameras_already_are_noticed(folder: Path, tmp_path: Path, make_pile: Any) -> None:
+    import shutil
+
+    from attentionvote.datasets.check import check_dataset
+
+    assert check_dataset(SileaneDataset(folder)).errors == ()
+    spoilt = Path(shutil.copytree(folder, tmp_path / "box"))
+    for count in (2, 5):
+        path = spoilt / "gt" / f"box_1_{count:03d}.json"
+        entries = json.loads(path.read_text())
+        for entry, pose in zip(entries, make_pile(count).camera_from_part, strict=True):
+            entry |= {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist()}
+        path.write_text(json.dumps(entries))
+    (error,) = check_dataset(SileaneDataset(spoilt)).errors
+    assert "with poses left as they stand in the file they would" in error

@@ -6,6 +6,6 @@ the files say: ``open_datasets(folder)`` finds what a folder holds, ``dataset.sc
 
 from attentionvote.datasets.dataset import Dataset, GroundTruth
 from attentionvote.datasets.depth_image import PinholeCamera
-from attentionvote.datasets.recognition import open_datasets
+from attentionvote.datasets.recognition import UnknownLayout, open_datasets
 
-__all__ = ["Dataset", "GroundTruth", "PinholeCamera", "open_datasets"]
+__all__ = ["Dataset", "GroundTruth", "PinholeCamera", "UnknownLayout", "open_datasets"]

@@ -143,6 +143,11 @@ class Dataset(ABC):
         """D of every part in metres, where the files or the paper's Table 1 say it."""
         return tuple(known.diameter if known else None for known in map(benchmark_object, self.parts))
 
+    @property
+    def camera_from_file(self) -> NDArray[np.float64]:
+        """``(4, 4)``, what takes poses as they stand in the files into the OpenCV camera frame."""
+        return np.eye(4)
+
     @cached_property
     def benchmark(self) -> BenchmarkObject | None:
         """The paper's object that this is, if it is one."""
@@ -155,7 +160,7 @@ class Dataset(ABC):
 
     def points(self, name: str, remove_background: bool | None = None) -> NDArray[np.float32]:
         """The cloud ``(P, 3)`` of a scene that need not have ground truth, in random order; see ``scene``."""
-        return self._scene(name, self.frame(name, labels=False), remove_background).points
+        return self.scene_of(name, self.frame(name, labels=False), remove_background).points
 
     def scene(self, name: str, remove_background: bool | None = None) -> Scene:
         """A scene in the camera frame, its points in a random order that the name decides.
@@ -168,9 +173,11 @@ class Dataset(ABC):
         Raises:
             ValueError: with one sentence, also when the background is to be removed and nothing says what it is.
         """
-        return self._scene(name, self.frame(name), remove_background)
+        return self.scene_of(name, self.frame(name), remove_background)
 
-    def _scene(self, name: str, frame: Frame, remove: bool | None) -> Scene:
+    def scene_of(self, name: str, frame: Frame, remove_background: bool | None = None) -> Scene:
+        """The scene of a picture that is open already; see ``scene``."""
+        remove = remove_background
         if remove and not frame.knows_background:
             raise ValueError(
                 f"{self.directory}: the background of {name} cannot be removed, because there is no picture of the "

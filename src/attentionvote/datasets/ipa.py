@@ -196,6 +196,11 @@ class IpaDataset(Dataset):
         return {kind: [name for name in self.names if name not in self._files[kind]] for kind in kinds}
 
     @property
+    def camera_from_file(self) -> NDArray[np.float64]:
+        """Half a turn about z."""
+        return OPENCV_FROM_IPA
+
+    @property
     def cycles(self) -> int:
         """Number of drop cycles."""
         return len(self._part_of_cycle)

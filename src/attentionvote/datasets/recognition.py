@@ -20,21 +20,26 @@ LOOKS = {
 }
 
 
+class UnknownLayout(ValueError):
+    """A folder that is none of the formats."""
+
+
 def open_datasets(directory: Path) -> list[Dataset]:
     """Every dataset in a folder, which may be a dataset's own, or hold several splits, objects or formats.
 
     Raises:
-        ValueError: with one sentence, when the folder does not exist or holds none of the formats.
+        UnknownLayout: with one sentence, when the folder does not exist or holds none of the formats.
+        ValueError: with one sentence, when a file that says what is there is damaged.
     """
     if not directory.is_dir():
-        raise ValueError(f"{directory}: the folder of a dataset must exist, got {_what(directory)}")
+        raise UnknownLayout(f"{directory}: the folder of a dataset must exist, got {_what(directory)}")
     found: dict[tuple[Opener, Path, str], list[Path]] = {}
     for folder, opener, group in _folders(directory, LEVELS):
         found.setdefault((opener, folder.parent, group), []).append(folder)
     datasets = [dataset for (opener, _, group), folders in found.items() for dataset in opener(folders, group)]
     if not datasets:
         looks = "; ".join(f"{name}: {look}" for name, look in LOOKS.items())
-        raise ValueError(f"{directory} must hold a dataset of a known layout, got none of them ({looks})")
+        raise UnknownLayout(f"{directory} must hold a dataset of a known layout, got none of them ({looks})")
     return datasets
 
 

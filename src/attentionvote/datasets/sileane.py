@@ -140,6 +140,11 @@ class SileaneDataset(Dataset):
             return (number(path, read_json(path, dict), "distance_threshold") / THRESHOLD_SHARE,)
         return super().diameters
 
+    @property
+    def camera_from_file(self) -> NDArray[np.float64]:
+        """From the world's frame into the camera's."""
+        return inverse(self._camera.world_from_camera)
+
     def drop_count(self, name: str) -> int:
         """The last number of the name; of another name the entries of its ground truth."""
         count = _order(self._known(name))[2]
@@ -154,7 +159,7 @@ class SileaneDataset(Dataset):
         """Poses in the camera frame."""
         poses, occlusion, labels = read_world_poses(self._file(name, "gt"))
         return GroundTruth(
-            inverse(self._camera.world_from_camera) @ poses,
+            self.camera_from_file @ poses,
             np.clip(1.0 - occlusion, 0.0, 1.0),
             np.zeros(len(poses), np.int32),
             labels,
