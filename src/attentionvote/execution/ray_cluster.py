@@ -7,9 +7,9 @@ import os
 import pickle
 import socket
 import uuid
-from collections.abc import Callable, Generator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,22 @@ class RayCluster:
                 "(pip install '.[cluster]'), or choose executor=local"
             )
 
+    @contextmanager
+    def kept(self, cores: int) -> Iterator[RayCluster]:
+        """One cluster for many calls, those of child processes too: itself, or one of this machine for the block.
+
+        Args:
+            cores: of a cluster that is started here.
+
+        Raises:
+            ConnectionError: when it cannot be started.
+        """
+        if self.address is not None:
+            yield self
+            return
+        with self._joined(cores) as ray:
+            yield replace(self, address=ray.get_runtime_context().gcs_address)
+
     def outcomes(
         self, task: Callable[[Any], Any], jobs: Sequence[Any], workers: int, retries: int, threads: int
     ) -> Generator[tuple[int, bytes], None, None]:
@@ -55,15 +71,21 @@ class RayCluster:
             ConnectionError: when there is no cluster at ``address``.
             ValueError: when no machine of it can take a job.
         """
+        with self._joined(workers * threads) as ray:
+            self._check_room(ray, threads)
+            yield from self._run(ray, task, jobs, workers, Attempts(retries, len(jobs)), threads)
+
+    @contextmanager
+    def _joined(self, cores: int) -> Iterator[Any]:
+        """The module ray, in a cluster while the block runs."""
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         import ray
 
         ours = not ray.is_initialized()
         if ours:
-            self._join(ray, workers * threads)
+            self._join(ray, cores)
         try:
-            self._check_room(ray, threads)
-            yield from self._run(ray, task, jobs, workers, Attempts(retries, len(jobs)), threads)
+            yield ray
         finally:
             if ours:
                 ray.shutdown()
@@ -73,7 +95,7 @@ class RayCluster:
         own |= {} if self.address else {"object_store_memory": _OBJECT_STORE}
         try:
             ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **own)
-        except (ConnectionError, RuntimeError, ValueError) as error:
+        except Exception as error:  # Ray's own too, of a node that takes too long to start
             first = str(error).strip().partition("\n")[0]
             raise ConnectionError(
                 f"the Ray cluster at address={self.address or 'null'} cannot be joined ({first}): start one with "

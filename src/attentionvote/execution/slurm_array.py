@@ -79,6 +79,7 @@ class SlurmArray:
         """See ``Executor``; the folder of a call that failed stays for its logs."""
         call = self.folder.absolute() / uuid.uuid4().hex[:12]
         (call / "outcomes").mkdir(parents=True)
+        call.chmod(0o700)  # jobs may hold the environment they run in
         (call / "task.pkl").write_bytes(pickle.dumps(task))
         run = _Run(self, call, jobs, workers, Attempts(retries, len(jobs)), threads)
         try:
