@@ -3,7 +3,8 @@
     make sweep OBJECT=connecting_rod TRIALS=30 [ARGS="workers=2 trainer.max_epochs=12 save_as=rod"]
 
 The space is a file of conf/sweep/. Stopped, also by kill -9, the same command goes on; TRIALS is what the study shall
-have in all. The best settings are an experiment afterwards: make train OBJECT=connecting_rod ARGS=experiment=rod.
+have in all. With executor=ray or executor=slurm the trials run on other machines (docs/scaling.md). The best settings
+are an experiment afterwards: make train OBJECT=connecting_rod ARGS=experiment=rod.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from command import command, configuring
-from configuration import CONF, ConfigurationError, parse, primary_groups
+from configuration import CONF, choices, compose, parse, primary_groups
 from omegaconf import DictConfig, OmegaConf
-from train import preset_of_hardware
+from train import preset_of_workers
+
+_PLACE = ("executor", "cluster")  # settings that say where trials run
 
 
 def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
@@ -28,10 +31,6 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     from sweep_job import SweepJob
     from sweep_report import check_save_as
 
-    if cfg.executor != "local":
-        raise ConfigurationError(
-            f"executor must be local for a sweep, whose trials are processes of this machine; got {cfg.executor!r}"
-        )
     check_save_as(cfg.save_as, words=words)
     with configuring():
         job = SweepJob(cfg, training_words(words), _space_name(words))
@@ -43,8 +42,19 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
 
 def training_words(words: Sequence[str]) -> list[str]:
     """The words that are about the trainings, not about the sweep."""
-    own = set(OmegaConf.load(CONF / "sweep.yaml")) - {"defaults"} | {"sweep", "workers", "force", "resume"}
-    return [word for word, o in zip(words, parse(words), strict=True) if o.key_or_group.split(".")[0] not in own]
+    own = set(OmegaConf.load(CONF / "sweep.yaml")) - {"defaults"} | {"sweep", "workers", "force", "resume", *_PLACE}
+    return [word for word, name in zip(words, _sections(words), strict=True) if name not in own]
+
+
+def preset_of_trials(words: Sequence[str]) -> list[str]:
+    """The preset of the machines that train, told by the words that say which these are."""
+    place = [word for word, name in zip(words, _sections(words), strict=True) if name in _PLACE]
+    return preset_of_workers(compose("sweep", [f"object={choices('object')[0]}", *place]), words)
+
+
+def _sections(words: Sequence[str]) -> list[str]:
+    """What each word is about, without the part after the first dot."""
+    return [str(override.key_or_group).split(".")[0] for override in parse(words)]
 
 
 def _space_name(words: Sequence[str]) -> str:
@@ -69,7 +79,7 @@ def main() -> None:
     said: list[str] = []
 
     def defaults(words: list[str]) -> list[str]:
-        machine = preset_of_hardware(words)
+        machine = preset_of_trials(words)
         said[:] = [*machine, *words]
         return machine
 

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from configuration import CONF, ConfigurationError, compose
-from hardware import cores
+from configuration import ConfigurationError, compose
+from executors import cluster_of, cores_of_a_job, executor_of
+from hardware import gpu_of_slot, visible_gpus
 from omegaconf import DictConfig, OmegaConf
 from optuna.trial import FrozenTrial, TrialState
-from sweep_driver import SweepDriver
+from sweep_driver import TRAIN, SweepDriver
+from sweep_ending import report
 from sweep_progress import SweepProgress
-from sweep_report import experiment_text, importances, run_of, write_table, write_whole
+from sweep_report import experiment_text, run_of, write_table
 from sweep_space import parse_space
 from sweep_study import Ledger, make_pruner, open_study, study_name
 from training_job import find_training
-from trial_place import for_trial
+from trial_place import for_trial, log_of, on_worker
 
+from attentionvote.execution import RayCluster
+
+TRIAL_JOB = Path(__file__).with_name("trial_job.py")
 log = logging.getLogger("attentionvote.sweep")
 
 
@@ -55,6 +62,20 @@ class SweepJob:
         self.folder = Path(cfg.sweeps) / self.part / self.name
         self.url = cfg.storage or f"sqlite:///{(self.folder / 'study.db').absolute()}"
         self.workers = cfg.workers or 1
+        self.threads = cores_of_a_job(cfg, self.workers)
+        self.executor = executor_of(cfg)
+        self.cluster = cluster_of(cfg)
+        self.gpus = visible_gpus(os.environ) if cfg.executor == "local" and self.workers > 1 else []
+        if self.url.startswith("sqlite") and not self._on_this_machine():
+            log.warning(
+                "the study is an SQLite file, which processes of several machines cannot be trusted to share: set "
+                "storage to a PostgreSQL database, unless the workers are on this machine"
+            )
+
+    def _on_this_machine(self) -> bool:
+        """Whether all trials are known to run here."""
+        own = {"ray": self.cluster["address"] is None, "slurm": self.cluster["slurm"]["system"] == "local"}
+        return own.get(self.cfg.executor, True)
 
     def open(self) -> None:
         """Open the study.
@@ -93,19 +114,21 @@ class SweepJob:
                 self.progress = progress
                 driver = SweepDriver(
                     ledger, self.words, self.directory, self._environment, self.workers, self.cfg.retries,
-                    self.cfg.heartbeat_s, self.folder / "logs", self._ended,
+                    self.cfg.heartbeat_s, self._logs, self._ended,
+                    TRAIN if self.cfg.executor == "local" else TRIAL_JOB,
                 )  # fmt: skip
                 try:
-                    driver.run(total, progress.tick)
+                    with self._one_cluster():
+                        driver.run(total, progress.tick)
                 finally:
                     write_table(ledger, self.folder)
-            return self._report()
+            return report(ledger, parent, self.part, self.base, self.folder, self.cfg.save_as)
 
     def words(self, values: Mapping[str, Any]) -> list[str]:
         """The words of a trial's training."""
-        share = max(1, cores() // self.workers)
-        threads = [] if any(w.startswith("trainer.threads=") for w in self.base) else [f"trainer.threads={share}"]
-        how = ["force=false", "resume=auto", f"workers={share}", *threads, f"tracking.parent={self.parent.id}"]
+        said = any(w.startswith("trainer.threads=") for w in self.base)
+        threads = [] if said else [f"trainer.threads={self.threads}"]
+        how = ["force=false", "resume=auto", f"workers={self.threads}", *threads, f"tracking.parent={self.parent.id}"]
         return [*self._chosen(values), *how]
 
     def directory(self, values: Mapping[str, Any]) -> Path:
@@ -115,8 +138,25 @@ class SweepJob:
     def _chosen(self, values: Mapping[str, Any]) -> list[str]:
         return [*self.base, *(setting.word(values[setting.name]) for setting in self.space)]
 
-    def _environment(self, number: int) -> dict[str, str]:
-        return for_trial(self.url, self.name, number, self.cfg.heartbeat_s, self.pruner)
+    @property
+    def _logs(self) -> Path:
+        return self.folder / "logs"
+
+    @contextmanager
+    def _one_cluster(self) -> Iterator[None]:
+        """With Ray one cluster for all trials, also where the first to need one would start it for itself."""
+        with ExitStack() as stack:
+            if isinstance(self.executor, RayCluster):
+                kept = stack.enter_context(self.executor.kept(self.workers * self.threads))
+                self.cluster["address"] = kept.address
+            yield
+
+    def _environment(self, number: int, slot: int) -> dict[str, str]:
+        trial = for_trial(self.url, self.name, number, self.cfg.heartbeat_s, self.pruner)
+        if self.cfg.executor == "local":
+            return trial | gpu_of_slot(self.gpus, slot)
+        log_file = log_of(self._logs, number)
+        return trial | on_worker(self.cfg.executor, self.cluster, self.threads, log_file, TRAIN)
 
     def _ended(self, trial: FrozenTrial) -> None:
         from attentionvote.tracking.group_run import adopt
@@ -132,71 +172,3 @@ class SweepJob:
         if best is not None and trial.value is not None:
             self.parent.log_metrics({"sweep/val_ap": trial.value, "sweep/best_val_ap": best.value or 0}, trial.number)
         write_table(self.ledger, self.folder)
-
-    def _report(self) -> dict[str, Any]:
-        from attentionvote.tracking.figures import importance_figure, trials_figure
-
-        ledger, best = self.ledger, self.ledger.best
-        for path in write_table(ledger, self.folder):
-            self.parent.log_file(path.name, path)
-        counts = {state.name.lower(): ledger.count(state) for state in TrialState if ledger.count(state)}
-        self.parent.log_tags({f"sweep.{state}": count for state, count in counts.items()})
-        failed = [
-            {"trial": trial.number, "reason": trial.user_attrs.get("reason")}
-            for trial in ledger.trials
-            if trial.state == TrialState.FAIL
-        ]
-        for failure in failed:
-            log.warning("trial %d failed: %s", failure["trial"], failure["reason"])
-        if best is None:
-            why = f"trial {failed[-1]['trial']}: {failed[-1]['reason']}" if failed else "all were pruned"
-            raise ValueError(
-                f"a sweep must have at least one complete trial, but of {len(ledger.trials)} trials {len(failed)} "
-                f"failed and none is complete; {why}"
-            )
-        complete = [trial for trial in ledger.trials if trial.state == TrialState.COMPLETE]
-        shares = importances(ledger)
-        figures = {
-            "trials.png": trials_figure(
-                {
-                    state.name.lower(): _scores([trial for trial in ledger.trials if trial.state == state])
-                    for state in (TrialState.COMPLETE, TrialState.PRUNED)
-                }
-            )
-        }
-        if shares:
-            figures["importance.png"] = importance_figure(shares)
-        else:
-            log.info("what matters most cannot be told from %d complete trials", len(complete))
-        for name, figure in figures.items():
-            figure.savefig(self.folder / name)
-            self.parent.log_file(name, self.folder / name)
-        values = {s.name: s.value(best.params[s.name]) for s in self.space}
-        title = f"Trial {best.number} of the sweep {self.name}: val/ap {best.value:.4f}, best of {len(complete)}."
-        text = experiment_text(self.base, values, title)
-        places = [self.folder / "best.yaml", self.folder.parent / "best.yaml"]
-        if self.cfg.save_as:
-            places.append(CONF / "experiment" / f"{self.cfg.save_as}.yaml")
-        for place in places:
-            write_whole(place, text)
-        self.parent.log_file("best.yaml", places[0])
-        log.info("best: trial %d, val/ap %.4f; its settings are in %s", best.number, best.value, places[-1])
-        return {
-            "stage": "sweep",
-            "object": self.part,
-            "study": self.name,
-            "run_id": self.parent.id,
-            "trials": len(ledger.trials),
-            "states": counts,
-            "best": {"trial": best.number, "val_ap": best.value, "run_id": run_of(best), "values": values},
-            "importance": {name: round(share, 4) for name, share in shares.items()},
-            "experiment": str(places[-1]),
-            "folder": str(self.folder),
-            "failed": failed,
-        }
-
-
-def _scores(trials: Sequence[FrozenTrial]) -> tuple[list[int], list[float]]:
-    """Numbers and values of trials; of a pruned one the last value that it reported."""
-    values = [trial.value if trial.value is not None else float("nan") for trial in trials]
-    return [trial.number for trial in trials], values

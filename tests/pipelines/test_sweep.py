@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,10 @@ def run(words: list[str]) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp_path: Path) -> None:
+@pytest.mark.timeout(1200)
+def test_killed_continued_pruned_reported_and_trained_with(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tracking.start_run(str(tmp_path / "mlflow.db"), "warm", system_interval_s=0).close()
     command = [sys.executable, "pipelines/sweep.py", *words]
     process = subprocess.Popen([*command, "trials=1"], cwd=ROOT, text=True, stdout=-1, stderr=-1)
@@ -83,8 +86,11 @@ def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp
                 value=0.5 + 0.1 * index, params=params, distributions=distributions, intermediate_values={1: 0.9}
             )
         )
-    process = subprocess.Popen([*command, "trials=6", "workers=2"], cwd=ROOT, text=True, stdout=-1, stderr=-1)
-    out, err = process.communicate(timeout=500)
+    # It goes on where it may run as well: on workers of a Ray cluster.
+    monkeypatch.setenv("RAY_AUTH_TOKEN", uuid.uuid4().hex)  # else one is written at home
+    more = ["trials=6", "workers=2", "executor=ray", "threads=1"]
+    process = subprocess.Popen([*command, *more], cwd=ROOT, text=True, stdout=-1, stderr=-1)
+    out, err = process.communicate(timeout=800)
     assert process.returncode == 0, err
     assert "Traceback" not in err
     assert "Warning" not in err
@@ -155,7 +161,7 @@ def test_a_sweep_of_failures_says_why(words: list[str], tmp_path: Path, caplog: 
         ("sweep.space=[{name: seed, kind: int, low: 2, high: 1}]", "low must be less than high, got 2 and 1"),
         ("save_as=paper", "save_as must not replace a file that no sweep wrote, got 'paper'"),
         ("save_as=smoke", "save_as must not replace a file that no sweep wrote"),
-        ("executor=ray", "executor must be local for a sweep.*got 'ray'"),
+        ("executor=rya", "executor must be one of local, ray, slurm; got 'rya', did you mean 'ray'?"),
         ("save_as=a/b", "save_as must be a name of letters, digits, - and _, got 'a/b'"),
         ("storage=nonsense", "storage must be the SQLAlchemy URI of a database that answers.*got nonsense"),
         ("~trainer.log_every_steps", "takes no word that deletes a setting"),
@@ -179,6 +185,41 @@ def test_the_study_is_named_by_what_it_searches_not_by_how_it_is_run(words: list
     assert same.startswith("brick-smoke-")
     assert name("trials=9", "workers=2", "retries=0", "save_as=x", "trainer.threads=2", "force=true") == same
     assert len({same, name("trainer.max_epochs=7"), name("sweep.pruner.kind=none")}) == 3
+
+
+def test_where_trials_run_is_no_business_of_their_trainings(words: list[str]) -> None:
+    place = ["executor=slurm", "cluster.gpus=1.0", "cluster.slurm.minutes=9", "threads=4", "workers=8"]
+    assert sweep.training_words([*words, *place]) == sweep.training_words(words)
+    assert sweep.preset_of_trials(["object=gear,brick", *place]) == ["experiment=gpu"]
+    assert sweep.preset_of_trials(["object=gear", "executor=ray"]) == ["experiment=compact"]
+    assert sweep.preset_of_trials(["object=gear", "executor=ray", "experiment=paper"]) == []
+
+
+def test_trials_of_one_machine_share_its_gpus(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
+
+    def gpu(slot: int, *more: str) -> str | None:
+        said = [*words, *more]
+        job = SweepJob(compose("sweep", said), sweep.training_words(said), "smoke")
+        return job._environment(9, slot).get("CUDA_VISIBLE_DEVICES")
+
+    assert [gpu(slot, "workers=3") for slot in range(3)] == ["4", "6", "4"]
+    assert gpu(0, "workers=1") is None
+    assert gpu(0, "workers=3", "executor=ray") is None  # Ray's business
+
+
+def test_a_file_is_no_study_for_several_machines(words: list[str], caplog: pytest.LogCaptureFixture) -> None:
+    def warned(*more: str) -> bool:
+        caplog.clear()
+        said = [*words, *more]
+        SweepJob(compose("sweep", said), sweep.training_words(said), "smoke")
+        return "the study is an SQLite file" in caplog.text
+
+    assert warned("executor=ray", "cluster.address=auto")
+    assert not warned("executor=ray", "cluster.address=auto", "storage='postgresql://me@database/sweeps'")
+    assert not warned("executor=ray")
+    assert not warned("executor=slurm", "cluster.slurm.system=local")
+    assert not warned()
 
 
 def test_an_experiment_says_what_the_sweep_was_given(tmp_path: Path) -> None:
