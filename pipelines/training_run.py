@@ -31,7 +31,8 @@ from attentionvote.simulation import Sensor
 from attentionvote.tracking.provenance import git_state
 from attentionvote.tracking.store import connect, resolve_store
 from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
-from attentionvote.training.checkpoint import FORMAT, AtomicCheckpoints, usable_checkpoint
+from attentionvote.training.checkpoint import FORMAT, usable_checkpoint
+from attentionvote.training.checkpoint_writer import AtomicCheckpoints
 from attentionvote.training.pictures import ScenePictures
 from attentionvote.training.progress import TrainingProgress
 from attentionvote.training.synced_norm import RowNormSync

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,12 @@ from attentionvote.model import AttentionVote
 from attentionvote.training.checkpoint import (
     FORMAT,
     KEY,
-    AtomicCheckpoints,
     load_trained,
     save_trained,
     usable_checkpoint,
     write_atomically,
 )
+from attentionvote.training.checkpoint_writer import AtomicCheckpoints
 
 ARGUMENTS: dict[str, Any] = {
     "diameter": 0.075,
@@ -168,3 +170,9 @@ def test_the_first_checkpoint_that_can_be_used_is_chosen(
     assert not (tmp_path / ".last.ckpt.123").exists()
     assert usable_checkpoint([best], {"model.other": torch.Size([3])}) is None
     assert "belongs to another network" in caplog.messages[-1]
+
+
+def test_reading_one_does_not_import_lightning() -> None:
+    program = "import sys, attentionvote.training.checkpoint; print('lightning' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == "False\n"
