@@ -22,7 +22,7 @@ settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
 # Fixtures that several folders of tests share.
-pytest_plugins = ["box_scenes", "brick_models", "databases", "tiny_bundle", "work_trees"]
+pytest_plugins = ["bop_split", "box_scenes", "brick_models", "databases", "tiny_bundle", "work_trees"]
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT / ".." / "shared" / "data"
 

@@ -1,0 +1,92 @@
+"""The figures of a BOP results CSV, for the verb score."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from attentionvote.evaluation.bop_files import (
+    BopPoses,
+    Image,
+    parse_name,
+    read_estimates,
+    read_models_info,
+    read_targets,
+    read_truth,
+)
+from attentionvote.evaluation.bop_scores import LENGTHS_MM, RESULT_LIMIT, RESULT_LIMITS, SHARES, bop_scores, selected
+from attentionvote.inference.ply_file import points_from_ply
+
+log = logging.getLogger("attentionvote.score")
+MOST_VERTICES = 10_000_000
+
+
+def scored(cfg: DictConfig) -> dict[str, Any]:
+    """Figures over all objects, and of every object alone (docs/scoring.md says what each means).
+
+    Raises:
+        ValueError: with one sentence, when a file is missing or wrong.
+    """
+    name = parse_name(cfg.results)
+    models = read_models_info(Path(cfg.models) / "models_info.json")
+    truth, images = read_truth(cfg.gt, cfg.suffix)
+    estimates, seconds = read_estimates(cfg.results)
+    outside = 0
+    if cfg.targets is not None:
+        targets = read_targets(cfg.targets)
+        lost = sorted(targets - set(images))
+        if lost:
+            raise ValueError(
+                f"{cfg.targets}: every target must be in {cfg.gt}, got scene {lost[0][0]}, im {lost[0][1]}"
+            )
+        images = sorted(targets)
+        before = len(estimates.values)
+        truth, estimates = _inside(truth, targets), _inside(estimates, targets)
+        outside = before - len(estimates.values)
+    vertices = {number: _vertices(Path(cfg.models), number) for number in sorted(set(truth.objects.tolist()))}
+    limit = cfg.result_limit or RESULT_LIMITS.get(name.dataset, RESULT_LIMIT)
+    scores = bop_scores(estimates, truth, images, models, vertices, limit)
+    if scores.beyond_limit or scores.elsewhere or outside:
+        log.info(
+            "not looked at: %d results beyond %d an image, %d of objects not in the image, %d outside the targets",
+            scores.beyond_limit, limit, scores.elsewhere, outside,
+        )  # fmt: skip
+    per_object = {str(number): asdict(found) for number, found in scores.per_object.items()}
+    return {
+        "format": "bop",
+        "method": name.method,
+        "dataset": f"{name.dataset}-{name.split}",
+        "bop25_mAP": scores.map,
+        "bop25_mAP_mm": scores.map_mm,
+        "seconds_per_image": seconds,
+        "images": scores.images,
+        "targets": sum(found.targets for found in scores.per_object.values()),
+        "estimates": sum(found.estimates for found in scores.per_object.values()),
+        "beyond_limit": scores.beyond_limit,
+        "elsewhere": scores.elsewhere,
+        "outside_targets": outside,
+        "result_limit": limit,
+        "thresholds": SHARES.round(2),
+        "thresholds_mm": LENGTHS_MM,
+        "per_object": per_object,
+    }
+
+
+def _inside(poses: BopPoses, images: set[Image]) -> BopPoses:
+    return selected(poses, np.array([image in images for image in map(tuple, poses.images.tolist())], dtype=bool))
+
+
+def _vertices(folder: Path, number: int) -> np.ndarray:
+    """Vertices ``(V, 3)`` in metres of a model; BOP's files are in millimetres."""
+    path = folder / f"obj_{number:06d}.ply"
+    try:
+        return points_from_ply(path.read_bytes(), MOST_VERTICES).astype(np.float64) / 1000
+    except OSError as error:
+        raise ValueError(f"{path}: the model cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: the model cannot be read, {error}") from error
