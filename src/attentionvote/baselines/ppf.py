@@ -1,0 +1,248 @@
+"""Point pair features (Drost et al., CVPR 2010) as OpenCV's ``ppf_match_3d`` has them, for every part in a bin.
+
+What we found out about the module (OpenCV 5.0.0, read in its sources and tried), and what is done about it:
+
+* The only length that depends on units is the clustering's: poses are merged within ``relativeSamplingStep`` *units of
+  the data*, whatever their rotation (the threshold for angles comes out as 30 radians), and their quaternions averaged
+  without regard to sign. In metres that is 5 cm: the answers are means of unrelated poses. ``setSearchParams`` is not
+  bound in Python. So clouds are handed over in a unit so small that nothing is merged, and ``hypotheses.merged``
+  does what the paper describes; OpenCV's own merging at 5 % D gave a tenth of the average precision.
+* ``relativeSceneDistance`` is a share of the *scene's* bounding box, axis by axis, not of the model. A bin is two to
+  four parts wide, so the documented .05 thins a scene far more than the model. Here both clouds are thinned to the
+  same voxel first, and the grid is made fine enough to leave the scene alone.
+* ``relativeDistanceStep`` is never read: the distance step is ``relativeSamplingStep`` of the box's diagonal.
+* Training time grows with the length of the hash table's chains, which flat parts make long: a thinned model of some
+  hundred points takes seconds, OpenCV's own sampling of a flat part (thousands) tens of minutes.
+* ICP's residual is no measure of quality across poses (it is of the points that it kept). Whole models pull hidden
+  sides onto the cloud, so only points that face the camera are registered, against the cloud around the pose.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from attentionvote.baselines.hypotheses import apart, fits, merged, placed
+from attentionvote.baselines.opencv import surface_matching, thinned, threads
+from attentionvote.geometry.pose import transform
+from attentionvote.part import Part
+
+Array = NDArray[np.float64]
+SCORES = ("votes", "fit")
+_MODEL_POINTS, _FIT_POINTS = 30_000, 1_500
+_LEAST_POINTS = 30  # fewer determine no pose
+_MOST_CELLS = 200  # along an edge of OpenCV's grid: 200 MB
+_UNITS_PER_DIAMETER = 1000.0  # OpenCV merges poses within ``sampling`` of a unit: nothing
+_ICP_TOLERANCE, _ICP_REJECTION, _ICP_LEVELS = 0.005, 2.5, 4  # OpenCV's defaults, fewer levels for few points
+
+
+class Detections(NamedTuple):
+    """Poses ``(R, 4, 4)`` camera from part, metres, and scores ``(R,)``, best first."""
+
+    camera_from_part: Array
+    scores: Array
+
+
+@dataclass(frozen=True)
+class PpfSettings:
+    """How a bin is searched; lengths are shares of D. The defaults were chosen on validation scenes.
+
+    Args:
+        sampling: voxel to which model and scene are thinned, and OpenCV's relative sampling step.
+        angles: steps of a full turn that angles are quantised in (OpenCV's numAngles).
+        reference_step: every so-many-th scene point votes for a pose.
+        merge_distance, merge_degrees: poses nearer to each other than both are one hypothesis.
+        hypotheses: most of them that are looked at further, those with most votes.
+        icp_iterations: of OpenCV's ICP; 0 leaves the poses as voted.
+        icp_points: most points of the scene that ICP sees.
+        score: ``votes`` (the sum of a hypothesis's votes, as OpenCV and the paper rank) or ``fit`` (share of the
+            model points facing the camera that have a scene point near; a few lines more, as users of ICP write).
+        fit_distance: near means within it.
+        separation: of two poses with centres nearer than this only the better one is given.
+
+    Raises:
+        ValueError: on an impossible value.
+    """
+
+    sampling: float = 0.05
+    angles: int = 30
+    reference_step: int = 5
+    merge_distance: float = 0.1
+    merge_degrees: float = 30.0
+    hypotheses: int = 100
+    icp_iterations: int = 30
+    icp_points: int = 15_000
+    score: str = "votes"
+    fit_distance: float = 0.01
+    separation: float = 0.1
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "sampling": (0.02, 0.2),
+            "angles": (8, 90),
+            "reference_step": (1, 100),
+            "merge_distance": (0.0, 1.0),
+            "merge_degrees": (0.0, 180.0),
+            "hypotheses": (1, 10_000),
+            "icp_iterations": (0, 1000),
+            "icp_points": (100, 1_000_000),
+            "fit_distance": (0.001, 0.5),
+            "separation": (0.0, 1.0),
+        }
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"ppf {name} must lie in {low}..{high}, got {getattr(self, name)}")
+        if self.score not in SCORES:
+            near = difflib.get_close_matches(str(self.score), SCORES, n=1, cutoff=0.0)[0]
+            raise ValueError(
+                f"ppf score must be one of {', '.join(SCORES)}, got {self.score!r}, did you mean {near!r}?"
+            )
+
+
+class PpfDetector:
+    """Finds every instance of one part by point pair features; trained when made.
+
+    Args:
+        part: what to look for; its symmetry says which poses are the same.
+        settings: of the search.
+        threads: of OpenCV. Voting runs on one in any case.
+
+    Raises:
+        ValueError: when OpenCV with its surface matching is missing.
+    """
+
+    def __init__(self, part: Part, settings: PpfSettings | None = None, threads: int = 1) -> None:
+        self.part, self.settings, self.threads = part, settings or PpfSettings(), threads
+        self._cv2: ModuleType = surface_matching()
+        low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
+        self._center = (low + high) / 2
+        self._reach = float(np.linalg.norm(part.vertices - self._center, axis=1).max())
+        self._unit = _UNITS_PER_DIAMETER / part.diameter
+        rng = np.random.default_rng(0)
+        self._model = _surface(part, _FIT_POINTS, rng)
+        model = thinned(_surface(part, _MODEL_POINTS, rng), self.settings.sampling * part.diameter)
+        self.model_points = len(model)
+        # The second argument is not read by OpenCV; the third is the number of angles.
+        step = self.settings.sampling
+        self._matcher: Any = self._cv2.ppf_match_3d.PPF3DDetector(step, step, self.settings.angles)
+        self._matcher.trainModel(self._scaled(model))
+
+    def detect(self, points: NDArray[np.floating], normals: NDArray[np.floating] | None) -> Detections:
+        """Every instance in a cloud, best score first; none when the cloud is too small to tell.
+
+        Args:
+            points: ``(P, 3)`` metres, camera frame, parts only (as the network's input).
+            normals: ``(P, 3)`` unit vectors towards the camera (``geometry.pointcloud.estimate_normals``).
+
+        Raises:
+            ValueError: when normals are missing, shapes disagree or a number is not finite.
+        """
+        cloud = _checked(points, normals)
+        if len(cloud) < _LEAST_POINTS:
+            return Detections(np.zeros((0, 4, 4)), np.zeros(0))
+        settings, diameter = self.settings, self.part.diameter
+        with threads(self._cv2, self.threads):
+            poses, scores = merged(
+                *self.votes(cloud[:, :3], cloud[:, 3:]),
+                self._center,
+                self.part.symmetry,
+                settings.merge_distance * diameter,
+                math.radians(settings.merge_degrees),
+            )
+            poses, scores = poses[: settings.hypotheses], scores[: settings.hypotheses]
+            if settings.icp_iterations:
+                poses = self.refined(poses, cloud)
+        if settings.score == "fit":
+            scores = fits(poses, self._model, cKDTree(cloud[:, :3]), settings.fit_distance * diameter)
+        kept = apart(poses, scores, self._center, settings.separation * diameter)
+        return Detections(poses[kept], scores[kept])
+
+    def votes(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> tuple[Array, Array]:
+        """What OpenCV's ``match`` answers: a pose ``(R, 4, 4)`` in metres and its votes ``(R,)`` a reference point."""
+        voxel = self.settings.sampling * self.part.diameter
+        scene = thinned(_checked(points, normals), voxel)
+        extent = np.ptp(scene[:, :3], axis=0)
+        if len(scene) < _LEAST_POINTS or extent.max() <= 0:
+            return np.zeros((0, 4, 4)), np.zeros(0)
+        # OpenCV divides by the extent of every axis: a plane at right angles to one would be cells of 0 / 0.
+        scene[0, :3] += np.where(extent < 0.01 * voxel, 0.01 * voxel, 0).astype(np.float32)
+        cells = min(math.ceil(extent.max() / voxel), _MOST_CELLS)
+        # Half a cell more: OpenCV cuts 1 / share down to a whole number.
+        found = self._matcher.match(
+            self._scaled(scene), min(1.0, 1 / (self.settings.reference_step + 0.5)), 1 / (cells + 0.5)
+        )
+        poses = np.array([np.asarray(pose.pose) for pose in found], dtype=np.float64).reshape(-1, 4, 4)
+        poses[:, :3, 3] /= self._unit
+        good = np.isfinite(poses).all(axis=(1, 2))
+        votes = np.array([pose.numVotes for pose in found], dtype=np.float64)
+        return _rigid(poses[good]), votes[good]
+
+    def refined(self, poses: Array, cloud: NDArray[np.float32]) -> Array:
+        """Poses ``(R, 4, 4)`` after OpenCV's ICP against a cloud ``(P, 6)``; a pose that it cannot move stays."""
+        icp = self._cv2.ppf_match_3d.ICP(self.settings.icp_iterations, _ICP_TOLERANCE, _ICP_REJECTION, _ICP_LEVELS)
+        cloud = cloud[:: math.ceil(len(cloud) / self.settings.icp_points)]
+        tree = cKDTree(cloud[:, :3])
+        moved = poses.copy()
+        for i, pose in enumerate(poses):
+            near = tree.query_ball_point(pose[:3, :3] @ self._center + pose[:3, 3], 1.2 * self._reach)
+            model = placed(self._model, pose)
+            if min(len(near), len(model)) < _LEAST_POINTS:
+                continue
+            _, _, step = icp.registerModelToScene(self._scaled(model), self._scaled(cloud[near]))
+            step = np.array(step, dtype=np.float64)
+            step[:3, 3] /= self._unit
+            if np.isfinite(step).all():
+                moved[i] = step @ pose
+        return _rigid(moved)
+
+    def _scaled(self, cloud: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Points and normals ``(P, 6)`` in OpenCV's unit."""
+        scaled = np.ascontiguousarray(cloud, dtype=np.float32).copy()
+        scaled[:, :3] *= np.float32(self._unit)
+        return scaled
+
+
+def _surface(part: Part, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Points uniform on the surface and outward normals ``(count, 6)``, part frame, metres."""
+    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    cross = np.cross(b - a, c - a)
+    area = np.linalg.norm(cross, axis=1)
+    chosen = rng.choice(len(area), size=count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    points = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    return np.concatenate([points, (cross[chosen] / area[chosen, None])], axis=1).astype(np.float32)
+
+
+def _checked(points: NDArray[np.floating], normals: NDArray[np.floating] | None) -> NDArray[np.float32]:
+    """Points and normals side by side ``(P, 6)``."""
+    if normals is None:
+        raise ValueError(
+            "point pair features need a normal at every point, got none: estimate them with "
+            "geometry.pointcloud.estimate_normals"
+        )
+    points, normals = np.asarray(points), np.asarray(normals)
+    if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
+        raise ValueError(f"points and normals must both have shape (P, 3), got {points.shape} and {normals.shape}")
+    cloud = np.concatenate([points, normals], axis=1).astype(np.float32)
+    if not np.isfinite(cloud).all():
+        bad = int((~np.isfinite(cloud)).any(axis=1).sum())
+        raise ValueError(f"points and normals must be finite, got {bad} points with NaN or inf")
+    length = np.linalg.norm(cloud[:, 3:], axis=1)
+    if len(cloud) and not np.abs(length - 1).max() < 0.1:
+        raise ValueError(f"normals must be unit vectors, got lengths {length.min():.3g}..{length.max():.3g}")
+    return cloud
+
+
+def _rigid(poses: Array) -> Array:
+    """The nearest rigid poses: OpenCV's products of float matrices are rotations to a few digits only."""
+    u, _, v = np.linalg.svd(poses[:, :3, :3])
+    u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
+    return transform(u @ v, poses[:, :3, 3])

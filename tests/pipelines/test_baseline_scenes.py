@@ -1,0 +1,65 @@
+"""The classical baseline over scenes: results beside the truth, its time, and the same from two processes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from baseline_scenes import ppf_results
+
+from attentionvote.baselines import PpfSettings
+from attentionvote.data.clouds import CloudSettings, measure
+from attentionvote.part import Part
+from attentionvote.scene import Scene
+from attentionvote.simulation import PartCaster, SceneSet, Sensor
+
+QUICK = PpfSettings(sampling=0.12, reference_step=4, hypotheses=10, score="fit", fit_distance=0.03)
+
+
+@pytest.fixture(scope="module")
+def scenes(box: Part, make_scenes: Callable[..., SceneSet]) -> list[Scene]:
+    """One box, two boxes, and a picture without any."""
+    caster, settings = PartCaster(box), CloudSettings(Sensor("gaussian", sigma_mm=0.1), density=6000, pool=6000)
+    seen = [measure(record, caster, settings) for record in make_scenes((1, 2))]
+    unseen = [measure(record, caster, settings) for record in make_scenes((1,), away=True)]
+    assert [len(scene.points) > 500 for scene in (*seen, *unseen)] == [True, True, False]
+    return [*seen, *unseen]
+
+
+def test_every_scene_has_its_results_truth_and_time(box: Part, scenes: list[Scene]) -> None:
+    results, seconds = ppf_results(box, scenes, QUICK)
+    assert seconds.shape == (3,)
+    assert (seconds[:2] > seconds[2]).all()  # nothing to search costs nothing; no training is in the time
+    for scene, result in zip(scenes, results, strict=True):
+        np.testing.assert_array_equal(result.gt_poses, scene.camera_from_part)
+        np.testing.assert_allclose(result.gt_occlusion, 1 - np.minimum(scene.visible_fraction, 1))
+    assert len(results[2].poses) == 0
+    # The box has no symmetry here and its sides are alike, so only the place is asked for.
+    offset = np.linalg.norm(results[0].poses[0, :3, 3] - scenes[0].camera_from_part[0, :3, 3])
+    assert offset < 0.15 * box.diameter
+
+
+def test_normals_are_estimated_where_a_scene_has_none(box: Part, scenes: list[Scene]) -> None:
+    with_normals, _ = ppf_results(box, scenes[:1], QUICK)
+    without, _ = ppf_results(box, [replace(scenes[0], normals=None), replace(scenes[2], normals=None)], QUICK)
+    np.testing.assert_allclose(without[0].poses, with_normals[0].poses, atol=1e-9)
+    assert len(without[1].poses) == 0
+
+
+def test_two_processes_find_the_same(box: Part, scenes: list[Scene]) -> None:
+    (one, _), (two, seconds) = (ppf_results(box, scenes, QUICK, workers=workers) for workers in (1, 2))
+    for here, there in zip(one, two, strict=True):
+        np.testing.assert_array_equal(here.poses, there.poses)
+        np.testing.assert_array_equal(here.scores, there.scores)
+    assert (seconds > 0).all()
+
+
+def test_a_missing_opencv_is_said_before_any_work(
+    box: Part, scenes: list[Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ValueError, match=r"cv2 is missing: .*\[benchmark\]"):
+        ppf_results(box, scenes, QUICK, workers=2)
