@@ -8,7 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, curves, evaluate
+from attentionvote.evaluation import (
+    NearestPointDistance,
+    PoseMetric,
+    SceneResult,
+    average_precision,
+    curves,
+    evaluate,
+    evaluate_at,
+)
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.geometry.symmetry import Symmetry
 
@@ -45,6 +53,9 @@ def test_evaluate_counts_what_was_laid_out(known, box):
         "recall_visible_50_60": 0, "recall_visible_70_80": 1, "recall_visible_90_100": 1,
         "center_error_mm": 3, "rotation_error_deg": 0,
     }  # fmt: skip
+    for n in (10, 5, 2):  # without the limit that makes it cheap
+        nearest = average_precision(known, NearestPointDistance.of(box()), n / 1000)
+        expected |= {f"add_s_precision_{n}": nearest.precision, f"add_s_recall_{n}": nearest.recall}
     figures = {f"{name}_{n}" for name in ("ap", "map", "f1") for n in (10, 5, 2)}
     assert set(metrics) == set(expected) | figures
     assert {name: metrics[name] for name in expected} == pytest.approx(expected, abs=1e-9)
@@ -69,6 +80,26 @@ def test_evaluate_leaves_out_what_cannot_be_measured(box):
     assert metrics["recall_visible_50_60"] == metrics["recall_10"] == metrics["ap_10"] == 0
     assert "center_error_mm" not in metrics
     assert "recall_visible_90_100" not in metrics
+
+
+def test_evaluate_takes_the_nearest_points_for_add_s(box):
+    # Turned over about its long axis a box covers itself: every point is far from its own place, none from another.
+    scene = SceneResult([moved(0, 0, 0, degrees=180)], [1.0], [moved(0, 0, 0)], [0.0])
+    metrics = evaluate([scene], box())
+    assert [metrics[f"{name}_recall_10"] for name in ("add", "add_s")] == [0, 1]
+    assert [metrics[f"{name}_precision_10"] for name in ("add", "add_s")] == [0, 1]
+
+
+def test_a_working_point_leaves_the_areas_and_cuts_the_rest(known, box):
+    # Only the first three results, with scores 1, .9 and .8: two of four found, one duplicate.
+    everything, cut = evaluate(known, box()), evaluate_at(known, box(), 0.75)
+    assert set(cut) == set(everything)
+    areas = {name for name in cut if name.startswith(("ap_", "map_", "f1_"))}
+    assert {name: cut[name] for name in areas} == {name: everything[name] for name in areas}
+    expected = {"precision_10": 2 / 3, "recall_10": 2 / 4, "add_precision_10": 2 / 3, "add_recall_10": 2 / 4}
+    assert {name: cut[name] for name in expected} == pytest.approx(expected)
+    kept = evaluate([scene.above(0.75) for scene in known], box())
+    assert {name: cut[name] for name in set(cut) - areas} == {name: kept[name] for name in set(cut) - areas}
 
 
 def test_evaluate_names_fractions_of_a_per_cent(known, box):

@@ -125,7 +125,7 @@ class NearestPointDistance:
         # Every point at a lies in a ball about its centroid; distance to a ball is convex.
         gap = np.linalg.norm(centroids_a[:, None] - centroids_b, axis=-1) - radius
         table = gap.clip(0.0)
-        tree = cKDTree(self.points)
+        tree, low, high = cKDTree(self.points), self.points.min(0), self.points.max(0)
         for i in range(len(a)):
             near = np.flatnonzero(table[i] <= self.limit)
             block = max(1, BLOCK_VALUES // (3 * len(self.points)))
@@ -133,7 +133,12 @@ class NearestPointDistance:
                 j = near[start : start + block]
                 scene = self.points @ np.swapaxes(b[j, :3, :3], -1, -2) + b[j, None, :3, 3]
                 in_part = (scene - a[i, :3, 3]) @ a[i, :3, :3]
-                table[i, j] = tree.query(in_part.reshape(-1, 3))[0].reshape(len(j), -1).mean(-1)
+                # No point of the model lies outside its box, and that distance needs no search.
+                outside = np.maximum(np.maximum(low - in_part, in_part - high), 0.0)
+                bound = np.linalg.norm(outside, axis=-1).mean(-1)
+                table[i, j] = np.maximum(table[i, j], bound)
+                j, in_part = j[bound <= self.limit], in_part[bound <= self.limit]
+                table[i, j] = tree.query(in_part.reshape(-1, 3))[0].reshape(len(j), len(self.points)).mean(-1)
         return table
 
 

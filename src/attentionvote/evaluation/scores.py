@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.evaluation.average_distance import AverageDistance
+from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
 from attentionvote.evaluation.average_precision import DetectionScores, score_tables
 from attentionvote.evaluation.matching import Matching, match
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
@@ -37,6 +37,7 @@ def evaluate(
     * ``duplicates_N``: results on a pose that a nearer result holds; ``strays_N``: results near nothing
       (both are false positives); ``misses_N``: required poses that were not found;
     * ``add_precision_N``, ``add_recall_N``: the same with ADD (Eq. 13) in place of the pose distance;
+    * ``add_s_precision_N``, ``add_s_recall_N``: with ADD-S, the mean distance to the *nearest* model point;
     * ``recall_visible_50_60`` ... ``recall_visible_90_100``: recall at 10 % D by visible per cent, lower
       edge included (the last bin also holds 100);
     * ``center_error_mm``, ``rotation_error_deg``: medians over the true positives at 10 % D.
@@ -47,7 +48,7 @@ def evaluate(
         scenes: every scene that was processed, also those without results.
         part: gives diameter, symmetry and model points.
         thresholds: fractions of the diameter; fewer are cheaper.
-        add: whether to compute the ADD figures, most of the time spent here.
+        add: whether to compute the ADD and ADD-S figures, most of the time spent here.
         metric: pose distance; of the part by default.
         occlusion_limit: ground truth occluded up to it (inclusive) must be found.
         result_limit: only this many best results of a scene count; all by default.
@@ -68,12 +69,16 @@ def evaluate(
         for kind in ("duplicates", "strays", "misses"):
             metrics[f"{kind}_{name}"] = float(sum(len(getattr(matching, kind)) for matching in matchings))
     if add:
-        average = AverageDistance.of(part, limit=max(thresholds) * part.diameter)
-        add_tables = distance_tables(scenes, average)
-        for fraction in thresholds:
-            scores = score_tables(scenes, add_tables, fraction * part.diameter, occlusion_limit, result_limit)
-            name = f"{100 * fraction:g}"
-            metrics |= {f"add_precision_{name}": scores.precision, f"add_recall_{name}": scores.recall}
+        reach = max(thresholds) * part.diameter
+        for kind, distance in (
+            ("add", AverageDistance.of(part, reach)),
+            ("add_s", NearestPointDistance.of(part, reach)),
+        ):
+            add_tables = distance_tables(scenes, distance)
+            for fraction in thresholds:
+                scores = score_tables(scenes, add_tables, fraction * part.diameter, occlusion_limit, result_limit)
+                name = f"{100 * fraction:g}"
+                metrics |= {f"{kind}_precision_{name}": scores.precision, f"{kind}_recall_{name}": scores.recall}
     matchings = _match_all(scenes, tables, DETAIL_THRESHOLD * part.diameter, occlusion_limit, result_limit)
     return metrics | recall_by_visibility(scenes, matchings) | pose_errors(scenes, matchings, part)
 
@@ -89,9 +94,10 @@ def evaluate_at(scenes: Sequence[SceneResult], part: Part, working_point: float,
         part, add: as in ``evaluate``.
         working_point: the score.
     """
-    everything = evaluate(scenes, part, add=add)
+    everything = evaluate(scenes, part, add=False)
     kept = evaluate([scene.above(working_point) for scene in scenes], part, add=add)
-    return {k: v if k.startswith(("ap_", "map_", "f1_")) else kept.get(k, v) for k, v in everything.items()}
+    areas = ("ap_", "map_", "f1_")
+    return everything | {k: v for k, v in kept.items() if not k.startswith(areas)}
 
 
 def recall_by_visibility(scenes: Sequence[SceneResult], matchings: Sequence[Matching]) -> dict[str, float]:
