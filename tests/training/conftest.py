@@ -33,8 +33,12 @@ SYMMETRIES = {
     "cyclic 2": Symmetry("cyclic", order=2),
     "cyclic 3, tilted": Symmetry("cyclic", TILTED, order=3),
     "dihedral 2": Symmetry("dihedral", order=2),
+    "dihedral 3": Symmetry("dihedral", order=3),
     "dihedral 4, tilted": Symmetry("dihedral", TILTED, order=4, flip_axis=ACROSS),
     "group": Symmetry("group", quaternions=[(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)]),
+    "tetrahedral": Symmetry(
+        "group", quaternions=[*np.eye(4), *((1, x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1))]
+    ),
     "revolution": Symmetry("revolution"),
     "revolution, tilted": Symmetry("revolution", TILTED),
     "revolution, flip": Symmetry("revolution", flip=True),

@@ -1,8 +1,10 @@
 """Rotation and pose errors that know a part's symmetry, as differentiable torch (paper section 3.4).
 
 Four rotation losses: the paper's ``slerp`` (Eq. 6), ``minra`` (Eq. 7) and ``nlerp`` on quaternions, and ``metric``,
-the rotational part of the pose distance of the evaluation (Bregier et al. 2017), which needs no sign and no special
-case for any symmetry class. For a body of revolution all quaternion forms become the angle between the axes (Eq. 8).
+the rotational part of the pose distance of the evaluation (Bregier et al. 2017). That one is the alternative to the
+paper's: it compares rotation matrices, so that there is no sign to choose (q and -q are one matrix, and Eq. 6 needs one
+of them as the label, Eq. 7 leaves it open), and symmetry is the same minimum over the group for every class. For a body
+of revolution all quaternion forms become the angle between the axes (Eq. 8).
 """
 
 from __future__ import annotations
