@@ -9,12 +9,14 @@ STAMP := $(VENV)/.setup-complete
 
 OBJECT ?=
 OBJECTS ?=
+TABLE ?=
 NAME ?=
 MESH ?=
 UNITS ?=
 RUN ?=
 TRIALS ?=
 TO ?=
+DIR ?=
 ARGS ?=
 PYTEST_ARGS ?=
 object := $(if $(OBJECT),object=$(OBJECT))
@@ -34,7 +36,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train sweep fleet smoke export evaluate promote rollback history score serve keys bench-serve image generate view part ui test test-fast lint format clean
+.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback history score serve keys bench-serve image generate view check-data write-data part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -73,6 +75,10 @@ sweep: $(STAMP) ## Search the settings that train best: OBJECT=connecting_rod [T
 
 fleet: $(STAMP) ## One model a part, and a leaderboard: OBJECTS=all or gear,brick [ARGS="experiment=paper workers=2"]
 	@$(PY) pipelines/fleet.py $(if $(OBJECTS),"objects='$(OBJECTS)'") $(ARGS)
+
+benchmark: $(STAMP) ## The paper's numbers beside ours: TABLE=3..9, fig8 or fig11 [OBJECTS=gear,brick ARGS="train=true"]
+	@$(PY) pipelines/benchmark.py $(if $(TABLE),table=$(if $(filter fig%,$(TABLE)),$(TABLE:fig%=figure_%),table_$(TABLE))) \
+		$(if $(OBJECTS),"objects='$(OBJECTS)'") $(ARGS)
 
 smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 cores: scenes, training, export, champion, a cell's check
 	@$(PY) pipelines/train.py object=$(smoke_object) experiment=smoke $(ARGS)
@@ -119,6 +125,12 @@ generate: $(STAMP) ## Drop parts into a bin by physics and keep the scenes: OBJE
 
 view: $(STAMP) ## Write an interactive 3D page and pictures of a scene: OBJECT=connecting_rod
 	@$(PY) pipelines/view.py $(object) $(ARGS)
+
+check-data: $(STAMP) ## Look at a dataset (IPA, Sileane or BOP layout): what it is and what is wrong with it: DIR=data/ipa
+	@$(PY) pipelines/check_data.py $(if $(DIR),"directory='$(DIR)'") $(ARGS)
+
+write-data: $(STAMP) ## Write generated scenes as IPA or BOP data: OBJECT=gear [ARGS="format=bop split=test"]
+	@$(PY) pipelines/write_data.py $(object) $(ARGS)
 
 part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.stl [UNITS=mm]; then `make train OBJECT=bracket`
 	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) $(ARGS)

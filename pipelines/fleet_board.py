@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from json_files import write_json
 from promotion_job import DATA_FACT
 from training_job import TrainingJob
+from whole_files import write_whole
 
 from attentionvote.inference import BundleError, load_bundle
 from attentionvote.simulation import SceneSet, scene_set_directory
@@ -139,8 +140,6 @@ def write(folder: Path, rows: Sequence[dict[str, Any]], left_out: Mapping[str, s
     if left_out:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in left_out.items())]
     place = folder / "leaderboard.md"
-    temporary = folder / ".leaderboard.md"
-    temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    temporary.replace(place)
+    write_whole(place, "\n".join(lines) + "\n")
     write_json(folder / "leaderboard.json", {"members": list(rows), "left_out": dict(left_out)})
     return place

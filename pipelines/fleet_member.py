@@ -32,8 +32,10 @@ class MemberTask:
         start = time.monotonic()
         answers: dict[str, Any] = {}
         for verb in VERBS:
-            # The training that these words mean, not the newest one.
+            # The training that these words mean and its bundle, not the newest ones.
             chosen = [f"run={answers['train']['run_id']}"] if verb == "export" else []
+            if verb == "evaluate":
+                chosen = [f"bundle='{Path(answers['export']['bundle']).name}'"]
             outcome = self._run(verb, [f"object={name}", *self.words[verb], *chosen], name)
             if outcome.result is None:
                 answers |= {"failed": verb, "sentence": outcome.sentence}

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from command import ConfigurationError, command, configuring
 from omegaconf import DictConfig
+from whole_files import whole, write_whole
 
 if TYPE_CHECKING:
     from attentionvote.part import Part
@@ -53,10 +52,10 @@ def run(cfg: DictConfig) -> dict[str, Any]:
         log.info("the part frame is not the file's: see part_from_file in %s", config)
 
     mesh, picture = Path(cfg.parts) / f"{name}.ply", Path(cfg.parts) / f"{name}.png"
-    _write(mesh, lambda path: write_surface(part.vertices, part.faces, path))
-    _write(picture, lambda path: write_picture(part, path))
+    whole(mesh, lambda path: write_surface(part.vertices, part.faces, path))
+    whole(picture, lambda path: write_picture(part, path))
     text = configuration_text(part, finding, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
-    _write(config, lambda path: path.write_text(text, encoding="utf-8"))
+    write_whole(config, text)
     log.info("look at %s, then: make train OBJECT=%s", picture, name)
     return {
         "stage": "part",
@@ -152,17 +151,6 @@ def _checked_name(cfg: DictConfig) -> str:
             f"name must be small letters, digits and underscores, a letter first; got {name!r}, e.g. name={nearest}"
         )
     return name
-
-
-def _write(path: Path, write: Callable[[Path], object]) -> None:
-    """Whole or not at all: under another name first."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

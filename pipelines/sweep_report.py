@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -20,6 +20,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sweep_space import Setting
 from sweep_study import CRASHES, Ledger
 from training_job import NOT_IDENTITY, RUN
+from whole_files import write_whole
 
 MARK = "Written by make sweep"  # files without it are the user's, and never replaced
 _LEAST_FOR_IMPORTANCE = 4  # complete trials
@@ -56,12 +57,11 @@ def write_table(ledger: Ledger, folder: Path) -> list[Path]:
     places = [folder / "trials.json", folder / "trials.csv"]
     write_whole(places[0], json.dumps(rows, indent=2) + "\n")
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    temporary = places[1].with_name(f".{places[1].name}.{os.getpid()}")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
-    temporary.replace(places[1])
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns)
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(places[1], text.getvalue())
     return places
 
 
@@ -162,10 +162,3 @@ def _built_on(names: Sequence[Any], experiments: Path) -> set[str]:
         defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
         rest += [entry for entry in defaults if isinstance(entry, str)]
     return found
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

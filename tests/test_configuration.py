@@ -20,7 +20,7 @@ from attentionvote.part import Part, PartSet
 FILES = sorted(CONF.rglob("*.yaml"))
 VERBS = [p.stem for p in FILES if p.parent == CONF]
 OBJECTS = [p.stem for p in FILES if p.parent.name == "object"]
-MANDATORY = {"part": ["name=bracket", "mesh=bracket.stl"]}
+MANDATORY = {"benchmark": ["table=table_6"], "part": ["name=bracket", "mesh=bracket.stl"]}
 INSTANTIATE_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_", "_args_"}
 
 

@@ -1,0 +1,158 @@
+"""Measure a table or figure of the paper: the paper's numbers, ours, and a baseline's on the same scenes.
+
+    make benchmark TABLE=6 [OBJECTS=connecting_rod,gear ARGS="train=true trainer.max_epochs=12 rows=ours"]
+
+TABLE is 3 to 9, fig8 or fig11 (conf/table/). What is trained already is exported, evaluated on the benchmark's frozen
+scenes and written into docs/benchmarks.md; train=true also trains what is missing; the rest says "not run". Settings
+are those of train, and those of the scenes: evaluation.dataset=DIR takes your copy of a dataset.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from command import Refused, command, configuring
+from configuration import CONF, ConfigurationError, compose, parse
+from fleet import words_of_verbs
+from omegaconf import DictConfig, OmegaConf
+from train import preset_of_hardware
+
+if TYPE_CHECKING:
+    from benchmark_table import Row
+
+log = logging.getLogger("attentionvote.benchmark")
+IMAGES = "images"  # beside the page
+RECORDED = CONF / "evaluation" / "benchmark.yaml"
+
+
+def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
+    """Measure what can be measured of a table, and write it down.
+
+    Args:
+        cfg: the benchmark's configuration.
+        words: it was composed of; those of the training are handed on.
+    """
+    from benchmark_cells import CellFailed
+    from benchmark_page import draw, markdown, put
+    from benchmark_table import BenchmarkTable
+    from folder_lock import locked_folder
+    from json_files import read_json, write_json
+
+    plain: Any = OmegaConf.to_container(cfg.table, resolve=True)
+    with configuring():
+        table = BenchmarkTable.of(table_name(words), plain)
+        objects, rows = table.chosen(cfg.objects, cfg.rows)
+    training, scenes = training_words(words), scene_words(words)
+    if cfg.record:
+        return record(cfg, objects, scenes)
+    folder = Path(cfg.benchmarks)
+    with locked_folder(folder, cfg.benchmarks, "benchmark", "benchmarks"):
+        place = folder / f"{table.name}.json"
+        stored = read_json(place) or {}
+        cells = {(cell["row"], cell["object"]): cell for cell in stored.get("cells", [])}
+        failures: dict[str, str] = {}
+        for row in rows:
+            for name in objects:
+                try:
+                    cell = _measure(cfg, training, scenes, row, name)
+                except CellFailed as error:
+                    failures[f"{row.name}, {name}"] = str(error)
+                    log.warning("%s, %s: %s", row.name, name, error)
+                    continue
+                if cell is None:
+                    log.info("%s, %s: not run (train=true trains it)", row.name, name)
+                    continue
+                cells[row.name, name] = {"row": row.name, "object": name, **cell}
+                write_json(place, {"table": table.name, "cells": list(cells.values())})
+        if cfg.page is not None:
+            page = Path(cfg.page)
+            picture = f"{IMAGES}/{table.name}.png"
+            drawn = table.curve is not None and draw(table, table.curve, cells, page.parent / picture)
+            put(page, table.name, markdown(table, cells, picture if drawn else None))
+            log.info("%s: written into %s", table.title, page)
+    result = {
+        "stage": "benchmark",
+        "table": table.name,
+        "cells": [cells[key] for key in cells],
+        "failures": failures,
+        "page": cfg.page,
+    }
+    if failures:
+        first = next(iter(failures.items()))
+        raise Refused(f"{len(failures)} cells could not be measured (first: {first[0]}: {first[1]})", result)
+    return result
+
+
+def _measure(
+    cfg: DictConfig, training: Sequence[str], scenes: Sequence[str], row: Row, name: str
+) -> dict[str, Any] | None:
+    from benchmark_cells import baseline_cell, network_cell
+    from hardware import cores
+
+    here = cfg.copy()
+    here.export, here.evaluate = [*cfg.export, *row.export], [*scenes, *cfg.evaluate, *row.evaluate]
+    with configuring():
+        words, _ = words_of_verbs(here, [*training, *row.train], name)
+    if row.detector == "network":
+        return network_cell(words, name, cfg.train)
+    # Where bundles lie and who signed them is nothing to the baseline.
+    on = [f"root={cfg.root}", *here.evaluate]
+    ppf: Any = OmegaConf.to_container(cfg.ppf)
+    return baseline_cell(on, name, row, Path(cfg.benchmarks), cfg.baseline_workers or cores(), ppf)
+
+
+def record(cfg: DictConfig, objects: Sequence[str], scenes: Sequence[str]) -> dict[str, Any]:
+    """Generate the frozen scenes of these parts and write their digests into ``RECORDED``."""
+    from evaluation_job import generated_set, set_spec
+    from hydra.utils import instantiate
+    from whole_files import write_whole
+
+    content = OmegaConf.load(RECORDED)
+    for name in objects:
+        own = compose("evaluate", [f"object={name}", f"root={cfg.root}", *scenes])
+        part = instantiate(own.object)
+        content.frozen[name] = generated_set(own, part, set_spec(own, part)).scenes.digest
+    head = "".join(line for line in RECORDED.read_text().splitlines(True) if line.startswith("#"))
+    content.frozen = dict(sorted(content.frozen.items()))
+    write_whole(RECORDED, head + OmegaConf.to_yaml(content))
+    return {"stage": "benchmark", "frozen": dict(content.frozen), "file": str(RECORDED)}
+
+
+def table_name(words: Sequence[str]) -> str:
+    """The chosen file of conf/table."""
+    return next(word.partition("=")[2] for word in reversed(words) if word.startswith("table="))
+
+
+def training_words(words: Sequence[str]) -> list[str]:
+    """The words that are about the trainings, not about the benchmark, the machine's preset first.
+
+    Raises:
+        ConfigurationError: when one names a single part.
+    """
+    own = set(OmegaConf.load(CONF / "benchmark.yaml")) - {"defaults"} | {"table", "evaluation"}
+    names = [str(override.key_or_group) for override in parse(words)]
+    if "object" in names:
+        raise ConfigurationError("a benchmark takes objects=NAME,NAME, got object=: say OBJECTS=...")
+    return [word for word, name in zip(words, names, strict=True) if name.split(".")[0] not in own]
+
+
+def scene_words(words: Sequence[str]) -> list[str]:
+    """The words that are about the scenes; the frozen ones unless others are named."""
+    named = [str(override.key_or_group) for override in parse(words)]
+    own = [word for word, name in zip(words, named, strict=True) if name.split(".")[0] == "evaluation"]
+    return own if "evaluation" in named else ["evaluation=benchmark", *own]
+
+
+if __name__ == "__main__":
+    said: list[str] = []
+
+    def presets(words: list[str]) -> list[str]:
+        """The preset of this machine, chosen and said once."""
+        machine = preset_of_hardware(words)
+        said[:] = [*machine, *words]
+        return machine
+
+    command("benchmark", lambda cfg: run(cfg, said), defaults=presets)

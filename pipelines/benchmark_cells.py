@@ -1,0 +1,140 @@
+"""What stands in one cell of a benchmark's table: a trained, exported, evaluated model, or the classical baseline."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmark_table import Row
+from configuration import compose
+from fleet_member import MemberTask
+from json_files import read_json, write_json
+
+if TYPE_CHECKING:
+    from attentionvote.part import Part
+    from attentionvote.scene import Scene
+
+log = logging.getLogger("attentionvote.benchmark")
+_KEPT = (
+    "figures",
+    "intervals",
+    "thresholds",
+    "ap_by_threshold",
+    "scenes",
+    "evaluation_set",
+    "frozen",
+    "sensor",
+    "machine",
+)
+
+
+class CellFailed(Exception):
+    """A cell that was to be measured could not be; one sentence."""
+
+
+def network_cell(
+    words: dict[str, tuple[str, ...]], name: str, may_train: bool, logs: Path | None = None
+) -> dict[str, Any] | None:
+    """The cell of a model, from verbs that do nothing when it is there already.
+
+    Args:
+        words: of ``train``, ``export`` and ``evaluate``.
+        name: of the part.
+        may_train: otherwise a model that is not trained is None.
+        logs: see ``MemberTask``.
+
+    Raises:
+        CellFailed: when a verb failed.
+        ValueError: when the training's configuration is impossible.
+    """
+    from training_job import find_training
+
+    cfg = compose("train", [f"object={name}", *words["train"]])
+    job = find_training(cfg)
+    if job.result is None and not may_train:
+        return None
+    answers = MemberTask(words, logs)(name)
+    if answers.get("failed"):
+        raise CellFailed(f"{answers['failed']} failed, {answers['sentence']}")
+    trained, evaluated = answers["train"], answers["evaluate"]
+    spec = job.specs["train"]
+    return {key: evaluated[key] for key in _KEPT} | {
+        "budget": {
+            "steps": trained["steps"],
+            "train_seconds": trained["train_seconds"],
+            "train_scenes": spec.cycles * len(spec.drop_counts),
+        },
+        "seed": cfg.seed,
+        "commit": trained["commit"],
+        "bundle": evaluated["bundle"],
+        "run_id": trained["run_id"],
+    }
+
+
+def baseline_cell(
+    evaluate: Sequence[str], name: str, row: Row, folder: Path, workers: int, ppf: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The cell of the classical baseline on the scenes that the models are measured on.
+
+    Its working point is chosen on a cycle of validation scenes, as a model's is.
+
+    Args:
+        evaluate: words of ``evaluate``.
+        name: of the part.
+        row: of the table.
+        folder: keeps what is measured.
+        workers: processes; the time of a scene is of one.
+        ppf: settings of ``PpfSettings``.
+
+    Raises:
+        ValueError: when OpenCV is missing, or the scenes cannot be had.
+    """
+    from baseline_scenes import ppf_results
+    from evaluation_job import generated_set, is_recorded, scenes_of, set_spec
+    from evaluation_report import figures_of, machine
+    from hydra.utils import instantiate
+
+    from attentionvote.baselines import PpfSettings
+    from attentionvote.registry.measurement import Measurement
+    from attentionvote.tracking.provenance import git_state
+    from attentionvote.training.operating_point import best_threshold
+
+    cfg = compose("evaluate", [f"object={name}", *evaluate])
+    part: Part = instantiate(cfg.object)
+    settings = PpfSettings(**ppf, **({} if row.detector == "ppf_icp" else {"icp_iterations": 0}))
+    frozen = scenes_of(cfg, part)
+    key = hashlib.sha256(json.dumps([asdict(settings), frozen.digest, part.digest]).encode()).hexdigest()
+    place = folder / row.detector / f"{name}-{key[:12]}.json"
+    known = read_json(place)
+    if known is not None and not cfg.force:
+        return known
+    validation = generated_set(cfg, part, set_spec(cfg, part, "val", 1))
+    log.info("%s, %s: %d scenes, and %d for its working point", row.name, name, len(frozen), len(validation))
+    chosen, _ = ppf_results(part, _shown(validation.clouds(), len(validation), name), settings, workers)
+    results, seconds = ppf_results(part, _shown(frozen.clouds(), len(frozen), name), settings, workers)
+    measured = Measurement(row.detector, results, best_threshold(chosen, part), seconds)
+    cell = figures_of(measured, part) | {
+        "scenes": len(frozen),
+        "evaluation_set": frozen.digest,
+        "frozen": is_recorded(cfg, part, frozen),
+        "sensor": cfg.evaluation.sensor.preset if cfg.evaluation.dataset is None else str(cfg.evaluation.dataset),
+        "machine": machine(),
+        "budget": None,
+        "seed": cfg.simulation.seed,
+        "commit": git_state(Path.cwd()).label,
+    }
+    place.parent.mkdir(parents=True, exist_ok=True)
+    write_json(place, cell)
+    return cell
+
+
+def _shown(clouds: Any, total: int, name: str) -> list[Scene]:
+    from rich.console import Console
+    from rich.progress import track
+
+    return list(track(clouds, f"{name}: clouds", total, console=Console(stderr=True)))

@@ -1,0 +1,105 @@
+"""Scenes of somebody else's dataset as something to measure on, once it is sure that the part is the dataset's."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from attentionvote.datasets import Dataset, open_datasets
+from attentionvote.geometry.pointcloud import sample_indices
+from attentionvote.geometry.pose import apply, inverse
+from attentionvote.part import Part
+from attentionvote.scene import Scene
+
+_SURFACE_POINTS, _CLOUD_POINTS = 20_000, 2_000
+_FRAME_TOLERANCE = 0.02  # of D: median distance of an instance's points to the part's surface at its pose
+
+
+@dataclass(frozen=True)
+class DatasetScenes:
+    """The scored scenes of one object of a dataset: see ``registry.measurement.MeasuredScenes``.
+
+    Args:
+        dataset: with poses.
+        part: in the dataset's own frame.
+        density: most points of a cloud; which ones is decided by the scene's name.
+    """
+
+    dataset: Dataset
+    part: Part
+    density: int
+
+    @classmethod
+    def find(cls, folder: Path, part: Part, density: int) -> DatasetScenes:
+        """The dataset in a folder, which must be one, of one object, and hold this part.
+
+        Raises:
+            ValueError: with one sentence, when it is none or another, or the part's frame is not the dataset's.
+        """
+        found = open_datasets(folder)
+        if len(found) != 1 or len(found[0].parts) != 1:
+            held = ", ".join(f"{one.title} {one.split}" for one in found) or "none"
+            raise ValueError(
+                f"{folder} must hold one dataset of one object, got {held}: name the folder of one of them"
+            )
+        scenes = cls(found[0], part, density)
+        if not len(scenes):
+            raise ValueError(f"{folder} must hold scenes with at least five parts, got {len(found[0].names)} others")
+        scenes.check_frame()
+        return scenes
+
+    @cached_property
+    def digest(self) -> str:
+        """Sha256 of the poses of all scenes, the names and the number of points: pictures are not read for it."""
+        h = hashlib.sha256(f"{self.dataset.format} {self.dataset.title} {self.dataset.split} {self.density}".encode())
+        for name in self.dataset.scored_names:
+            truth = self.dataset.ground_truth(name)
+            h.update(name.encode())
+            h.update(np.round(truth.camera_from_part * 1e6).astype(np.int64).tobytes())
+            h.update(np.round(truth.visible_fraction * 1e6).astype(np.int64).tobytes())
+        return h.hexdigest()
+
+    def __len__(self) -> int:
+        return len(self.dataset.scored_names)
+
+    def clouds(self) -> Iterator[Scene]:
+        """Every scored scene without its background, at most ``density`` points."""
+        for name in self.dataset.scored_names:
+            scene = self.dataset.scene(name)
+            kept = sample_indices(len(scene.points), min(self.density, len(scene.points)), np.random.default_rng(0))
+            yield Scene(
+                scene.points[kept],
+                scene.instance_ids[kept],
+                scene.camera_from_part,
+                np.clip(scene.visible_fraction, 0.0, 1.0),
+                scene.part_ids,
+            )
+
+    def check_frame(self) -> None:
+        """Whether the points of the most visible instance of a scene lie on the part's surface at its pose.
+
+        Raises:
+            ValueError: when they do not: mesh and poses are in different frames or units.
+        """
+        if not self.dataset.has_labels:
+            return
+        scene = next(self.clouds())
+        instance = int(np.argmax(scene.visible_fraction))
+        points = scene.points[scene.instance_ids == instance][:_CLOUD_POINTS]
+        if not len(points):
+            return
+        surface = cKDTree(self.part.surface_points(_SURFACE_POINTS, np.random.default_rng(0)))
+        in_part = apply(inverse(scene.camera_from_part[instance]), points)
+        apart = float(np.median(surface.query(in_part)[0]))
+        if apart > _FRAME_TOLERANCE * self.part.diameter:
+            raise ValueError(
+                f"{self.part.name} must have the frame of the poses in {self.dataset.directory} (points within "
+                f"{1000 * _FRAME_TOLERANCE * self.part.diameter:.1f} mm of its surface), got {1000 * apart:.1f} mm: "
+                "use the dataset's own mesh, in metres and not moved"
+            )

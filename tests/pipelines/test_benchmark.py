@@ -1,0 +1,118 @@
+"""The verb benchmark: real trainings' places, real evaluations and the real baseline on tiny scenes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import benchmark
+import pytest
+from configuration import ConfigurationError, compose
+from export_job import ExportJob
+from json_files import write_json
+from training_job import find_training
+
+ROOT = Path(__file__).resolve().parents[2]
+# One cycle of two scenes with a few bricks.
+FEW = ["evaluation.cycles=1", "evaluation.density=2000", "evaluate=['simulation=smoke','simulation.drop_counts=[2,3]']"]
+COARSE = ["baseline_workers=1", "ppf.sampling=0.15"]
+PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "page=page.md"]
+
+
+def run(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """The verb in a process of its own."""
+    command = [sys.executable, ROOT / "pipelines" / "benchmark.py", *PLACES, *FEW, *words]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path, env=dict(os.environ)
+    )
+
+
+@pytest.mark.slow
+def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any, tmp_path: Path) -> None:
+    """The brick is trained and exported; two rows want another training, which nobody has made."""
+    bundle = export_brick("model", "feed" * 8)
+    trained = find_training(compose("train", ["object=brick", "experiment=smoke", "outputs=outputs/train"])).directory
+    trained.mkdir(parents=True)
+    (trained / "model.ckpt").write_bytes(b"weights")
+    facts = {"run_id": "feed" * 8, "steps": 8, "train_seconds": 60.0, "commit": "c" * 40}
+    write_json(trained / "result.json", {"stage": "train", "object": "brick", **facts})
+    ExportJob.find(compose("export", ["object=brick", "scenes=32"])).finish(bundle, {})
+    smoke = ["experiment=smoke", "force=false", "export=['scenes=32']"]
+    done = run(
+        tmp_path, "table=table_5", "objects=brick", *smoke, "rows='ours,VoteNet-style,PPF'", *COARSE
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    ours, ppf = result["cells"]
+    assert [(cell["row"], cell["object"]) for cell in (ours, ppf)] == [("ours", "brick"), ("PPF", "brick")]
+    assert ours["evaluation_set"] == ppf["evaluation_set"]
+    assert ours["bundle"] == bundle.digest
+    assert (ours["seed"], ours["commit"], ours["budget"]["steps"]) == (0, "c" * 40, 8)
+    assert ppf["budget"] is None
+    for cell in (ours, ppf):
+        assert cell["scenes"] == 2
+        assert cell["figures"]["latency_p50_ms"] > 0
+        assert len(cell["thresholds"]) == len(cell["ap_by_threshold"]) == 21
+    assert "VoteNet-style, brick: not run (train=true trains it)" in done.stderr
+    page = (tmp_path / "page.md").read_text()
+    assert "| paper: AttentionVote, AP at 10 % D | 0.967 | 0.992 | 0.996 | 1.000 | 0.989 |" in page
+    assert f"| **ours**, AP at 10 % D | {ours['figures']['ap_10']:.3f} | not run | not run | not run |  |" in page
+    assert "| VoteNet-style, AP at 2 % D | not run | not run | not run | not run |  |" in page
+    # Another call for another object leaves these cells, and measures nothing anew.
+    again = run(tmp_path, "table=table_5", "objects=pepper", *smoke, "rows=ours")
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout)["cells"] == result["cells"]
+    assert (tmp_path / "page.md").read_text() == page
+
+
+def test_words_of_trainings_and_of_scenes_are_told_apart() -> None:
+    words = ["experiment=compact", "table=table_6", "evaluation.cycles=2", "trainer.max_epochs=12", "rows=ours"]
+    assert benchmark.training_words(words) == ["experiment=compact", "trainer.max_epochs=12"]
+    assert benchmark.scene_words(words) == ["evaluation=benchmark", "evaluation.cycles=2"]
+    assert benchmark.scene_words(["evaluation=default"]) == ["evaluation=default"]
+    with pytest.raises(ConfigurationError, match="a benchmark takes objects=NAME,NAME, got object="):
+        benchmark.training_words(["object=gear"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["rows=theirs"], "benchmark: rows must be among those of table_6, ours, VoteNet-style, PPF, PPF and ICP; got"),
+        (["objects=gear"], "benchmark: objects must be among those of table_6, vertical_bearing_pedestal, "),
+        (["trainer.max_epoch=3"], "benchmark: there is no setting 'trainer.max_epoch', did you mean"),
+    ],
+)
+def test_what_cannot_be_is_said_before_any_work(tmp_path: Path, words: list[str], said: str) -> None:
+    done = run(tmp_path, "table=table_6", "experiment=smoke", *words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.strip().splitlines()[-1].startswith(said)
+    assert not (tmp_path / "page.md").exists()
+
+
+def test_the_frozen_scenes_are_recorded_by_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And an evaluation on scenes with another digest says so."""
+    from evaluation_job import generated_set, is_recorded, set_spec
+    from hydra.utils import instantiate
+    from omegaconf import OmegaConf
+
+    recorded = tmp_path / "benchmark.yaml"
+    recorded.write_text("# why\ndefaults:\n- default\nsplit: benchmark\nfrozen: {zebra: abc}\n")
+    monkeypatch.setattr(benchmark, "RECORDED", recorded)
+    few = ["evaluation.cycles=1", "simulation=smoke", "simulation.drop_counts=[1]", "workers=1"]
+    cfg = compose("benchmark", ["table=table_5", f"root={tmp_path}"])
+    answer = benchmark.record(cfg, ["brick"], ["evaluation=benchmark", *few])
+    own = compose("evaluate", ["object=brick", "evaluation=benchmark", f"root={tmp_path}", *few])
+    part = instantiate(own.object)
+    frozen = generated_set(own, part, set_spec(own, part))
+    assert answer["frozen"] == {"brick": frozen.scenes.digest, "zebra": "abc"}
+    assert recorded.read_text().startswith("# why\ndefaults:\n")
+    assert list(OmegaConf.load(recorded).frozen) == ["brick", "zebra"]
+    for digest, expected in ((frozen.scenes.digest, True), ("0" * 64, False)):
+        OmegaConf.update(own, "evaluation.frozen", {"brick": digest}, force_add=True)
+        assert is_recorded(own, part, frozen) is expected
+    OmegaConf.update(own, "evaluation.frozen", {}, merge=False)
+    assert is_recorded(own, part, frozen) is None
