@@ -36,7 +36,7 @@ def report(
     """
     from attentionvote.tracking.figures import importance_figure, trials_figure
 
-    best = ledger.best
+    best, study = ledger.best, ledger.study.study_name
     for path in write_table(ledger, folder):
         parent.log_file(path.name, path)
     counts = {state.name.lower(): ledger.count(state) for state in TrialState if ledger.count(state)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,7 @@ class SweepJob:
                     TRAIN if self.cfg.executor == "local" else TRIAL_JOB,
                 )  # fmt: skip
                 try:
-                    with self._one_cluster():
+                    with self._one_cluster() if done < total or lost else nullcontext():
                         driver.run(total, progress.tick)
                 finally:
                     write_table(ledger, self.folder)
