@@ -21,6 +21,13 @@ from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.part import Part
 from attentionvote.scene import Scene
 
+# What a user would try, in this order: as voted, with OpenCV's ICP, and ranked by what ICP explains.
+VARIANTS = {
+    "ppf": PpfSettings(icp_iterations=0),
+    "ppf_icp": PpfSettings(),
+    "ppf_icp_fit": PpfSettings(score="fit"),
+}
+
 
 @dataclass(frozen=True)
 class PpfTask:
