@@ -132,7 +132,7 @@ def _of_counts(dataset: Dataset, where: str) -> list[Finding]:
                 f"{where}: {what} has {expected} scenes with at least {LEAST_DROPS} drops, here are {scored}",
             )
         )
-    if isinstance(dataset, IpaDataset):
+    if isinstance(dataset, IpaDataset) and not dataset.is_generated:
         if dataset.benchmark and dataset.split not in ("train", "test", "real"):
             found.append(
                 Finding(
@@ -195,7 +195,7 @@ def _scored(dataset: Dataset) -> int | None:
 
 def _expected(dataset: Dataset) -> int | None:
     known = dataset.benchmark
-    if known is None or dataset.format == "bop":
+    if known is None or dataset.format == "bop" or dataset.is_generated:
         return None
     if dataset.format == "sileane":
         return known.sileane and known.sileane[0] * (known.sileane[1] - LEAST_DROPS)

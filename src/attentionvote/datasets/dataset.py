@@ -18,6 +18,8 @@ from attentionvote.scene import BACKGROUND, Scene
 
 # Fewer drops than these are not scored (paper section 4.1).
 LEAST_DROPS = 5
+# What `make write-data` leaves in a folder of its own: such a set carries a public one's layout, not its content.
+RECEIPT = "written.json"
 
 
 class GroundTruth(NamedTuple):
@@ -152,6 +154,11 @@ class Dataset(ABC):
     def benchmark(self) -> BenchmarkObject | None:
         """The paper's object that this is, if it is one."""
         return benchmark_object(self.parts[0]) if len(self.parts) == 1 else None
+
+    @property
+    def is_generated(self) -> bool:
+        """Whether ``make write-data`` wrote it: then nobody printed how many scenes it must have."""
+        return (self.directory / RECEIPT).is_file()
 
     @property
     def scored_names(self) -> tuple[str, ...]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -143,6 +142,7 @@ class IpaDataset(Dataset):
         self.split = "real" if real else split
         self._files: dict[str, dict[str, Path]] = {"depth": {}, "gt": {}, "labels": {}}
         self._part_of_cycle: dict[str, Path] = {}
+        self._by_folder: dict[Path, IpaParameters] = {}
         for folder in self._folders:
             self._collect(folder)
         self.names = tuple(sorted(set().union(*self._files.values())))
@@ -235,10 +235,6 @@ class IpaDataset(Dataset):
         if path is None:
             raise ValueError(f"{self.directory}: scene {name} has no file of its {kind}")
         return path
-
-    @cached_property
-    def _by_folder(self) -> dict[Path, IpaParameters]:
-        return {}
 
     def _parameters(self, name: str) -> IpaParameters:
         folder = self._part_of_cycle[self._known(name).partition("/")[0]]

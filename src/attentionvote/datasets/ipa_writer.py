@@ -40,7 +40,7 @@ class IpaWriter:
     def __init__(self, folder: Path, part_name: str, camera: PinholeCamera, clip_start: float, clip_end: float) -> None:
         self._folder, self._part_name, self._camera = folder, part_name, camera
         self._coding = DepthCoding.between(clip_start, clip_end, MISSING)
-        size, offsets = _big_picture(camera)
+        size, offsets = big_picture(camera)
         parameters = {
             "resolutionX": camera.width,
             "resolutionY": camera.height,
@@ -107,8 +107,12 @@ class IpaWriter:
         return name
 
 
-def _big_picture(camera: PinholeCamera) -> tuple[int, tuple[int, int]]:
-    """Side of the square picture about the optical axis that holds the camera's, and where in it that one begins."""
+def big_picture(camera: PinholeCamera) -> tuple[int, tuple[int, int]]:
+    """Side of the square picture about the optical axis that holds the camera's, and where in it that one begins.
+
+    Raises:
+        ValueError: with one sentence, when the layout cannot describe the camera.
+    """
     if not np.isclose(camera.fx, camera.fy, rtol=1e-9):
         raise ValueError(f"an IPA camera must have one focal length, got fx {camera.fx} and fy {camera.fy}")
     twice = np.array([2 * camera.cx + 1, 2 * camera.cy + 1])

@@ -11,8 +11,8 @@ from attentionvote.datasets.dataset import Dataset
 from attentionvote.datasets.ipa import IpaDataset
 from attentionvote.datasets.sileane import CAMERA_FILE, DEPTH_FOLDERS, SileaneDataset
 
-# How far below the given folder a dataset is looked for: root, split, object.
-LEVELS = 4
+# How far below the given folder a dataset is looked for: formats, datasets, splits, scenes or objects.
+LEVELS = 5
 LOOKS = {
     "IPA": "<split>/<Object>/ with parameter.json and gt/cycle_*/ or p_depth/cycle_*/",
     "Sileane": "<object>/ with camera_params.txt and gt/*.json or depth/*.PNG",
