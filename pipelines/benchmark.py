@@ -111,12 +111,13 @@ def record(cfg: DictConfig, objects: Sequence[str], scenes: Sequence[str]) -> di
     from whole_files import write_whole
 
     content = OmegaConf.load(RECORDED)
+    frozen = dict(content.get("frozen", {}))
     for name in objects:
         own = compose("evaluate", [f"object={name}", f"root={cfg.root}", *scenes])
         part = instantiate(own.object)
-        content.frozen[name] = generated_set(own, part, set_spec(own, part)).scenes.digest
+        frozen[name] = generated_set(own, part, set_spec(own, part)).scenes.digest
     head = "".join(line for line in RECORDED.read_text().splitlines(True) if line.startswith("#"))
-    content.frozen = dict(sorted(content.frozen.items()))
+    content.frozen = dict(sorted(frozen.items()))
     write_whole(RECORDED, head + OmegaConf.to_yaml(content))
     return {"stage": "benchmark", "frozen": dict(content.frozen), "file": str(RECORDED)}
 
