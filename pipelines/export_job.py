@@ -118,10 +118,11 @@ class ExportJob:
         Raises:
             ValueError: when the checkpoint, the part or the held-out scenes are not what they were.
         """
-        from attentionvote.export import Limits, held_out, model_card
+        from attentionvote.export import Limits, held_out, model_card, used_otherwise
         from attentionvote.training.checkpoint import load_trained
 
         model, metadata = load_trained(self.training / MODEL)
+        metadata = used_otherwise(model, metadata, self.cfg.voting_radius, self.cfg.peak_threshold)
         root = Path(self.cfg.root)
         scenes = held_out.find_test_scenes(metadata, self.part, root)
         settings = held_out.cloud_settings(metadata)
@@ -176,6 +177,7 @@ class ExportJob:
             "versions": package_versions(),
             "signer": fingerprint(self.key.public_key()),
             "settings": [self.cfg.scenes, self.cfg.golden, dict(self.cfg.limits)],
+            "used": [self.cfg.voting_radius, self.cfg.peak_threshold],
         }
         return self.folder / f"export-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]}.json"
 

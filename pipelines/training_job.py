@@ -113,6 +113,12 @@ def _check(cfg: DictConfig, specs: dict[str, SceneSetSpec]) -> None:
                 "model.confidence must be quality with model.refinement, whose scores Eq. 10 does not train; got "
                 f"{cfg.model.confidence}: set model.refinement=null"
             )
+    most = max(cfg.trainer.peak_threshold, cfg.trainer.train_heat)
+    if cfg.model.proposal_source == "fps" and most > 1:
+        raise ValueError(
+            "trainer.peak_threshold and trainer.train_heat must be at most 1 with model.proposal_source=fps, whose "
+            f"proposals all have heat 1; got {most:g}"
+        )
     if cfg.data.pool > cfg.data.density:
         raise ValueError(f"data.pool must be at most data.density ({cfg.data.density}), got {cfg.data.pool}")
     if cfg.data.points < cfg.model.centers[0]:

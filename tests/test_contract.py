@@ -170,7 +170,16 @@ def test_a_text_that_is_no_card_is_one_sentence(text: str, message: str) -> None
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", [f.name for f in fields(ModelCard)])
+def test_a_voting_radius_is_on_the_card_only_where_it_differs() -> None:
+    assert "voting_radius" not in CARD.to_json()
+    other = replace(CARD, voting_radius=0.008)
+    assert ModelCard.from_json(other.to_json()).voting_radius == 0.008
+    assert other.core().voting_radius == 0.008  # the graph carries it
+    with pytest.raises(ValueError, match="card voting_radius must be positive metres, got -1"):
+        replace(CARD, voting_radius=-1)
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(ModelCard) if f.name != "voting_radius"])
 def test_every_field_is_needed(name: str) -> None:
     content = json.loads(CARD.to_json())
     del content[name]

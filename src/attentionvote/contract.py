@@ -20,6 +20,8 @@ VERSION = 1
 UNITS = "m"
 FRAME = "camera: x right, y down, z forward (OpenCV)"
 CARD_KEY = "attentionvote"  # of the card in the graph's metadata_props
+# Came later: absent where it is None, so that older cells read such cards and newer ones read old cards.
+_OPTIONAL = ("voting_radius",)
 INPUTS = ("points", "normals")
 
 
@@ -83,6 +85,7 @@ class ModelCard:
         density: normals are estimated on at most this many points of the cloud.
         normal_neighbors: neighbours of that estimation.
         peak_threshold, confidence_threshold: a proposal below either is no detection.
+        voting_radius: metres in which the graph gathers votes where that is not the training's; None where it is.
         distance: nearest and farthest depth (metres) of the clouds the model was trained for.
         extent: largest side of the axis-parallel box around such a cloud, metres.
         data: digests of the scene sets by split.
@@ -113,6 +116,7 @@ class ModelCard:
     versions: Mapping[str, str] = field(default_factory=dict)
     parity: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Mapping[str, Any] = field(default_factory=dict)
+    voting_radius: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("points", "votes", "proposals", "density", "normal_neighbors"):
@@ -120,6 +124,8 @@ class ModelCard:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"card {name} must be a whole number of at least 1, got {value!r}")
         object.__setattr__(self, "extent", _length("extent", self.extent))
+        if self.voting_radius is not None:
+            object.__setattr__(self, "voting_radius", _length("voting_radius", self.voting_radius))
         if not isinstance(self.distance, (tuple, list)) or len(self.distance) != 2:
             raise ValueError(f"card distance must be two lengths, nearest and farthest, got {self.distance!r}")
         near, far = (_length("distance", value) for value in self.distance)
@@ -168,6 +174,9 @@ class ModelCard:
     def to_json(self) -> str:
         """Canonical JSON: the same card, the same text."""
         content = {"contract_version": VERSION, "units": UNITS, "frame": FRAME, **asdict(self)}
+        for name in _OPTIONAL:
+            if content[name] is None:
+                del content[name]
         return json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False)
 
     @classmethod
@@ -208,9 +217,9 @@ def is_detection(
 
 
 def _plain(what: str, kind: type, content: object) -> dict[str, Any]:
-    """The fields of a dataclass from a JSON object, neither more nor fewer."""
+    """The fields of a dataclass from a JSON object, neither more nor fewer but for the optional ones."""
     names = [f.name for f in fields(kind)]
-    if not isinstance(content, dict) or set(content) != set(names):
+    if not isinstance(content, dict) or not set(names) - set(_OPTIONAL) <= set(content) <= set(names):
         got = sorted(content) if isinstance(content, dict) else type(content).__name__
         raise ValueError(f"{what} must have the fields {', '.join(names)}; got {got}")
     return dict(content)

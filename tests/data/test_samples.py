@@ -50,8 +50,13 @@ def test_augmentation_can_be_off_and_can_add_noise(clouds: Clouds) -> None:
     np.testing.assert_allclose(points, scene.points, atol=1e-7)
     np.testing.assert_allclose(poses, scene.camera_from_part, atol=1e-12)
     np.testing.assert_allclose(normals, scene.normals, atol=1e-7)
-    noisy, *_ = Augmentation(False, 0.0, jitter_mm=2.0).apply(scene.points, scene.normals, scene.camera_from_part, rng)
+    noisy, same, truth = Augmentation(False, 0.0, jitter_mm=2.0).apply(
+        scene.points, scene.normals, scene.camera_from_part, rng
+    )
     assert np.std(noisy - scene.points) == pytest.approx(0.002, rel=0.1)
+    # Noise after the normals (Table 4's other reading): they, and the truth, stay what they were.
+    np.testing.assert_allclose(same, scene.normals, atol=1e-7)
+    np.testing.assert_allclose(truth, scene.camera_from_part, atol=1e-12)
 
 
 def test_a_sample_keeps_points_normals_and_instances_together(clouds: Clouds, layout: Layout) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from attentionvote.export.bundle_writer import point_latest, write_bundle
-    from attentionvote.export.checkpoint_card import model_card
+    from attentionvote.export.checkpoint_card import model_card, used_otherwise
     from attentionvote.export.onnx_file import export_graph
     from attentionvote.export.parity import compare, measure_parity
     from attentionvote.export.parity_record import Limits, Parity, table
@@ -23,6 +23,7 @@ __all__ = [
     "model_card",
     "point_latest",
     "table",
+    "used_otherwise",
     "write_bundle",
     "write_triton",
 ]
@@ -31,6 +32,7 @@ _MODULE_OF = {
     "point_latest": "bundle_writer",
     "write_bundle": "bundle_writer",
     "model_card": "checkpoint_card",
+    "used_otherwise": "checkpoint_card",
     "export_graph": "onnx_file",
     "compare": "parity",
     "measure_parity": "parity",

@@ -10,7 +10,41 @@ from attentionvote.contract import ModelCard, PartCard
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
 
+_MOST_HEAT = 1.0  # of a farthest vote
 _PACKAGES = ("attentionvote", "torch", "onnx", "onnxscript", "onnxruntime", "numpy", "scipy")
+
+
+def used_otherwise(
+    model: AttentionVote, metadata: Mapping[str, Any], voting_radius: float | None, peak_threshold: float | None
+) -> dict[str, Any]:
+    """The metadata of a network that gathers votes or accepts peaks otherwise than its training's test did.
+
+    The network's test radius is set. Figures of the training's test are left out when anything differs from what they
+    were measured with; the confidence threshold stays the one that was chosen on the training's validation scenes.
+
+    Args:
+        model: the network.
+        metadata: of its checkpoint.
+        voting_radius: metres in which votes are gathered (Table 9); None keeps it.
+        peak_threshold: heat a proposal needs (Fig. 11); None keeps it.
+
+    Raises:
+        ValueError: when no proposal could pass the threshold.
+    """
+    changed = dict(metadata)
+    if peak_threshold is not None:
+        if model.farthest is not None and peak_threshold > _MOST_HEAT:
+            raise ValueError(
+                f"peak_threshold must be at most {_MOST_HEAT:g}, the heat of all farthest-point proposals, got "
+                f"{peak_threshold:g}"
+            )
+        changed["peak_threshold"] = float(peak_threshold)
+    before = model.test_voting_radius or model.voting_radius
+    if voting_radius is not None:
+        model.test_voting_radius = float(voting_radius)
+    if (model.test_voting_radius or before, changed["peak_threshold"]) != (before, metadata["peak_threshold"]):
+        changed["test"] = {}
+    return changed
 
 
 def model_card(
@@ -40,6 +74,7 @@ def model_card(
         raise ValueError("the checkpoint must be of a finished training (model.ckpt), got one without a working point")
     stored = metadata["part"]
     low, high = part.vertices.min(0), part.vertices.max(0)
+    radius = model.test_voting_radius
     return ModelCard(
         part=PartCard(
             name=stored["name"],
@@ -64,6 +99,7 @@ def model_card(
         commit=commit,
         versions=package_versions(),
         evaluation={name: float(value) for name, value in metadata["test"].items()},
+        voting_radius=None if radius is None or radius == model.voting_radius else float(radius),
     )
 
 

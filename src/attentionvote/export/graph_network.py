@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch._higher_order_ops.scan import scan
 
-from attentionvote.export.graph_neighbors import find_neighborhoods
+from attentionvote.export.graph_neighbors import farthest_point_order, find_neighborhoods
 from attentionvote.model import AttentionVote, Predictions
 from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.point_features import pair_features_reference
@@ -101,6 +101,14 @@ class GraphRefiner(nn.Module):
         return layer.correct(pooled, center, rotation, context)
 
 
+class GraphFarthestVotes(nn.Module):
+    """``FarthestVotes`` of a batch of one: the farthest-point Scan that also orders the cloud."""
+
+    def forward(self, votes: Float[Tensor, "1 votes 3"], count: int) -> Int[Tensor, "1 count"]:
+        """Indices of the sampled votes."""
+        return farthest_point_order(votes[0], count)[None]
+
+
 class ExportNetwork(nn.Module):
     """Points and normals in, poses out, nothing else needed: ``AttentionVote`` for a batch of one.
 
@@ -116,6 +124,8 @@ class ExportNetwork(nn.Module):
             GraphSetAbstraction(layer) for layer in _layers(model.backbone.abstractions, SetAbstraction)
         )
         model.refiners = nn.ModuleList(GraphRefiner(layer) for layer in _layers(model.refiners, Refiner))
+        if model.farthest is not None:
+            model.farthest = GraphFarthestVotes()
         self.model = model.eval()
 
     def forward(self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"]) -> Predictions:
