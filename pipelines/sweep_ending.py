@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from configuration import CONF
 from optuna.trial import FrozenTrial, TrialState
-from sweep_report import experiment_text, importances, run_of, write_table, write_whole
+from sweep_report import experiment_text, importances, run_of, write_table
 from sweep_study import Ledger
+from whole_files import write_whole
 
 if TYPE_CHECKING:
     from attentionvote.tracking import Run
