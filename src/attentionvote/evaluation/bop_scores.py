@@ -116,7 +116,7 @@ def bop_scores(
 
 def selected(poses: BopPoses, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> BopPoses:
     """The poses of the given indices ``(M,)``, or of a mask ``(N,)``."""
-    return BopPoses(*(values[chosen] for values in poses))
+    return BopPoses(poses.images[chosen], poses.objects[chosen], poses.poses[chosen], poses.values[chosen])
 
 
 def _within_limit(estimates: BopPoses, limit: int) -> BopPoses:
