@@ -212,6 +212,29 @@ def test_the_check_data_lacks_pictures_and_little_else(shared_data: Callable[[st
     assert [f.severity for f in result.findings] == ["error", "warning", "warning"]
     assert result.errors == ("bunny, test: every scene lacks its depth image, the first is bunny_3_070",)
     assert (result.scored, result.expected) == (11, 4 * 76)
+    assert (result.opened, result.instances) == (0, 825)  # every file of poses is sound
+
+
+def test_poses_without_pictures_are_read_all_the_same(copy: Path) -> None:
+    spoil_units(copy)
+    shutil.rmtree(copy / "p_depth")
+    lacks, units = report(copy).errors
+    assert "every scene lacks its depth image" in lacks
+    assert "looks like millimetres" in units
+
+
+def test_a_damaged_list_of_poses_is_a_finding(tmp_path: Path, make_pile: Callable[..., Any], box: Any) -> None:
+    from attentionvote.datasets.bop_models import write_models
+
+    write_models(tmp_path / "boxes" / "models", {1: box})
+    writer = BopSceneWriter(tmp_path / "boxes" / "test" / "000000")
+    pile = make_pile(2)
+    writer.write(0, pile.pinhole, *pile[1:6], [1, 1])
+    writer.finish()
+    (tmp_path / "boxes" / "test" / "000000" / "scene_gt.json").write_text("{")
+    errors = report(tmp_path).errors
+    assert errors
+    assert all("scene_gt.json: the file must be JSON" in error for error in errors)
 
 
 def test_bop_units_and_frames_are_checked(tmp_path: Path, make_pile: Callable[..., Any]) -> None:

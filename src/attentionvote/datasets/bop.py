@@ -55,8 +55,8 @@ class BopDataset(Dataset):
         self._loaded: tuple[str, _SceneFiles] | None = None
         self.names = tuple(
             f"{scene}/{int(image):06d}"
-            for scene in self._folders
-            for image in sorted(self._scene_files(scene).camera, key=_image_id)
+            for scene, folder in self._folders.items()
+            for image in sorted(read_json(folder / f"scene_camera{self._suffix}.json", dict), key=_image_id)
         )
         info = models_info_of(self.directory)
         self._diameters = read_diameters(info) if info is not None else {}

@@ -33,7 +33,7 @@ class Report(NamedTuple):
         scored: scenes with at least five drops; None where that cannot be read.
         expected: how many there should be; None where nothing says it.
         opened: scenes whose files were read whole.
-        instances: parts in them.
+        instances: parts in them, and in those of which only the poses could be read.
         placement: of poses on points.
         findings: errors first.
     """
@@ -59,7 +59,7 @@ def check_dataset(
 
     Args:
         dataset: as ``open_datasets`` gives it.
-        most_scenes: how many are opened, those with most parts among them.
+        most_scenes: how many are opened, the last one among them. Of a scene without its picture the poses are read.
         progress: called with the number of scenes done and the number to do.
     """
     where = f"{dataset.title}, {dataset.split}"
@@ -71,18 +71,18 @@ def check_dataset(
     placement, opened, instances = _try_diameters(dataset, findings), 0, 0
     for done, index in enumerate(chosen):
         name = dataset.names[index]
-        if name not in lacking:
-            try:
+        try:
+            if not lacking.get(name):
                 frame = dataset.frame(name)
                 placement.add(dataset.scene_of(name, frame, remove_background=False))
-            except (ValueError, OSError) as error:
-                sentence = " ".join(str(error).split())
-                problems[_kind(sentence)].append(sentence)
-            else:
                 opened, instances = opened + 1, instances + len(frame.ground_truth.part_ids)
-                if dataset.has_labels:
-                    for kind, sentence in _of_labels(frame, name):
-                        problems[kind].append(f"{where}: {sentence}")
+                for kind, sentence in _of_labels(frame, name) if dataset.has_labels else ():
+                    problems[kind].append(f"{where}: {sentence}")
+            elif "gt" not in lacking[name]:
+                instances += len(dataset.ground_truth(name).part_ids)
+        except (ValueError, OSError) as error:
+            sentence = " ".join(str(error).split())
+            problems[_kind(sentence)].append(sentence)
         if progress is not None:
             progress(done + 1, len(chosen))
     findings += [Finding("error", _first_of(sentences)) for sentences in problems.values()]
@@ -100,12 +100,16 @@ def check_dataset(
     return Report(dataset, _scored(dataset), _expected(dataset), opened, instances, verdict, tuple(findings))
 
 
-def _of_files(dataset: Dataset, where: str, found: list[Finding]) -> set[str]:
-    """Names of the scenes that lack a file."""
+def _of_files(dataset: Dataset, where: str, found: list[Finding]) -> dict[str, set[str]]:
+    """The kinds of files that a scene lacks, by its name."""
     if not dataset.names:
         found.append(Finding("error", f"{where}: there must be scenes, got none in {dataset.directory}"))
-        return set()
-    missing = dataset.missing_files()
+        return {}
+    try:
+        missing = dataset.missing_files()
+    except (ValueError, OSError) as error:
+        found.append(Finding("error", " ".join(str(error).split())))
+        return {}
     for kind, names in missing.items():
         if not names:
             continue
@@ -118,7 +122,11 @@ def _of_files(dataset: Dataset, where: str, found: list[Finding]) -> set[str]:
         found.append(Finding(severity, f"{where}: {many} its {KIND_OF_FILE[kind]}, the first is {names[0]}"))
     if not dataset.has_labels:
         found.append(Finding("warning", f"{where}: there are no images of labels, so points have no instance"))
-    return {name for names in missing.values() for name in names}
+    lacking: dict[str, set[str]] = defaultdict(set)
+    for kind, names in missing.items():
+        for name in names:
+            lacking[name].add(kind)
+    return lacking
 
 
 def _of_counts(dataset: Dataset, where: str) -> list[Finding]:
