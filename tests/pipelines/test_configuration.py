@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -143,6 +144,22 @@ def test_the_ablations_of_the_benchmarks_are_trainings(words: list[str]) -> None
 
 def test_there_are_ablations_in_the_benchmarks() -> None:
     assert len(ABLATIONS) >= 5
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["trainer.peak_threshold=1.5"], "must be at most 1 with model.proposal_source=fps, .* got 1.5"),
+        (["trainer.train_heat=2"], "must be at most 1 with model.proposal_source=fps, .* got 2"),
+        (["trainer.train_heat=2", "model.proposal_source=heatmap"], ""),
+    ],
+)
+def test_thresholds_that_no_farthest_vote_passes_are_refused(words: list[str], message: str) -> None:
+    from training_job import find_training
+
+    cfg = compose("train", ["object=connecting_rod", "experiment=votenet", *words])
+    with pytest.raises(ValueError, match=message) if message else nullcontext():
+        find_training(cfg)
 
 
 @pytest.mark.parametrize("word", ["trainer.learning_rate=null", "model.voxel_fraction=null", "data.points=null"])
