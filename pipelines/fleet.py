@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from command import Refused, command, configuring
 from configuration import CONF, ConfigurationError, choices, compose, nearest, parse, sentence
 from omegaconf import DictConfig, OmegaConf
+from several_parts import only_part
 from train import preset_of_workers
 
 if TYPE_CHECKING:
@@ -115,7 +116,10 @@ def members(objects: str, training: Sequence[str]) -> tuple[dict[str, TrainingJo
         cfg = compose("train", [f"object={name}", *training])
         try:
             with configuring():
-                jobs[name] = find_training(cfg)
+                job = find_training(cfg)
+                if everything:  # a set's parts come by themselves
+                    only_part(job.part, "objects=all")
+                jobs[name] = job
         except ConfigurationError as error:
             left_out[name] = sentence(error)
         if name in left_out and not everything:

@@ -16,9 +16,9 @@ from folder_lock import locked_folder
 from hydra.utils import instantiate
 from json_files import read_json
 from omegaconf import DictConfig, OmegaConf
-from several_parts import only_part
+from several_parts import check_classes
 
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_specs
 
 log = logging.getLogger("attentionvote.train")
@@ -32,10 +32,10 @@ RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """One training: ``directory`` for its files, the ``part``, and the scene sets it needs by split."""
+    """One training: ``directory`` for its files, the ``part`` (or set), and the scene sets it needs by split."""
 
     directory: Path
-    part: Part
+    part: Parts
     specs: dict[str, SceneSetSpec]
 
     @property
@@ -71,14 +71,17 @@ def find_training(cfg: DictConfig) -> TrainingJob:
         ValueError: with one sentence, when the parts of the configuration do not fit together.
         OSError: when the part's mesh is missing.
     """
-    part = only_part(instantiate(cfg.object), "a training")
+    part: Parts = instantiate(cfg.object)
     specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation, resolve=True))
+    check_classes(cfg.model.classes, part)
     _check(cfg, specs)
     plain = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(plain, dict)
     for key in NOT_IDENTITY:
         section, _, leaf = key.rpartition(".")
         (plain[section] if section else plain).pop(leaf, None)
+    if len(part.parts) > 1:  # whether the number was also typed makes no other training
+        plain["model"]["classes"] = len(part.parts)
     digest = hashlib.sha256(json.dumps([plain, part.digest], sort_keys=True).encode()).hexdigest()
     return TrainingJob(Path(cfg.outputs) / part.name / digest[:12], part, specs)
 

@@ -96,16 +96,21 @@ def _draw(
     from attentionvote.tracking.figures import ap_threshold_figure, precision_recall_figure
     from attentionvote.tracking.scene_pictures import scene_picture
 
-    part, metric = module.part, PoseMetric.of(module.part)
-    scores = {f"{100 * t:g} % D": average_precision(results, metric, t * part.diameter) for t in THRESHOLDS}
-    lines = {label: (s.curve_recall, s.curve_precision) for label, s in scores.items()}
-    areas = {label: s.ap for label, s in scores.items()}
-    tracked.log_figure("test/precision_recall.png", precision_recall_figure(lines, areas))
-    against = curves(results, part)
-    tracked.log_figure("test/ap_threshold.png", ap_threshold_figure(against.thresholds, {"test": against.ap}))
+    parts = module.part.parts
+    by_threshold = {}
+    for k, part in enumerate(parts):
+        own, metric = [scene.of_part(k) for scene in results], PoseMetric.of(part)
+        scores = {f"{100 * t:g} % D": average_precision(own, metric, t * part.diameter) for t in THRESHOLDS}
+        lines = {label: (s.curve_recall, s.curve_precision) for label, s in scores.items()}
+        areas = {label: s.ap for label, s in scores.items()}
+        which = f"_{part.name}" if len(parts) > 1 else ""
+        tracked.log_figure(f"test/precision_recall{which}.png", precision_recall_figure(lines, areas))
+        against = curves(own, part)
+        by_threshold[part.name if which else "test"] = against.ap
+    tracked.log_figure("test/ap_threshold.png", ap_threshold_figure(against.thresholds, by_threshold))
     batch = next(iter(data.test_dataloader())).first(2).to(module.device)
     for i, inputs in enumerate(picture_inputs(module, batch, threshold)):
-        tracked.log_figure(f"test/scene_{i}.png", scene_picture(**inputs, title=f"{part.name}, test scene {i}"))
+        tracked.log_figure(f"test/scene_{i}.png", scene_picture(**inputs, title=f"{module.part.name}, test scene {i}"))
 
 
 def log_losses(tracked: Any) -> dict[str, list[float]]:

@@ -17,6 +17,7 @@ from json_files import write_json
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
+from several_parts import described, network_arguments
 from sweep_trial import best_score, trial_callbacks
 from training_data import prepare_data
 from training_job import MODEL, RESULT, RUN, TrainingJob
@@ -59,10 +60,7 @@ class TrainingRun:
         L.seed_everything(cfg.seed, verbose=False)
         self.threads = t.threads or place.cores
         torch.set_num_threads(self.threads)
-        box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
-        arguments = OmegaConf.to_container(cfg.model, resolve=True)
-        assert isinstance(arguments, dict)
-        arguments |= {"diameter": part.diameter, "box": box}
+        arguments = network_arguments(cfg.model, part)
         model: AttentionVote = instantiate(arguments, _convert_="all")
         loss = AttentionVoteLoss(part, cfg.loss.weights, LossSettings(**cfg.loss.settings))
         self.clouds = CloudSettings(
@@ -72,13 +70,7 @@ class TrainingRun:
             "format": FORMAT,
             "version": __version__,
             "model": {str(k): v for k, v in arguments.items() if k != "_target_"},
-            "part": {
-                "name": part.name,
-                "title": part.title,
-                "diameter": float(part.diameter),
-                "digest": part.digest,
-                "symmetry": asdict(part.symmetry),
-            },
+            **described(part),
             "points": cfg.data.points,
             "clouds": asdict(self.clouds),
             "peak_threshold": t.peak_threshold,

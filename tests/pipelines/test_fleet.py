@@ -50,8 +50,9 @@ def test_all_is_every_part_whose_mesh_is_there(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
     jobs, left_out = fleet.members("all", TINY)
     assert {"brick", "gear", "connecting_rod"} <= set(jobs)
-    assert sorted(left_out) == ["bunny", "tless_20", "tless_22", "tless_29"]
+    assert sorted(left_out) == ["bunny", "industrial", "tless_20", "tless_22", "tless_29"]
     assert "SileaneBunny.obj" in left_out["bunny"]
+    assert "object must be one part for objects=all, got industrial" in left_out["industrial"]
     assert list(fleet.members("gear, brick,gear", TINY)[0]) == ["gear", "brick"]
     with pytest.raises(ConfigurationError, match=r"^object bunny: .*SileaneBunny.obj"):
         fleet.members("brick,bunny", TINY)

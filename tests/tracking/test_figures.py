@@ -44,8 +44,18 @@ def _scene(correct):
     found = poses[: len(correct)].copy()
     found[:, 0, 3] += 0.01
     return scene_picture(
-        points, votes, rng.random(60), centers, centers, found, correct, poses, BOX_VERTICES, BOX_FACES, title="scene 1"
-    )
+        points,
+        votes,
+        rng.random(60),
+        centers,
+        centers,
+        found,
+        correct,
+        poses,
+        [BOX_VERTICES],
+        [BOX_FACES],
+        title="scene 1",
+    )  # fmt: skip
 
 
 def test_scene_picture_shows_correct_poses_green_and_wrong_ones_red():
@@ -59,7 +69,7 @@ def test_scene_picture_shows_correct_poses_green_and_wrong_ones_red():
 def test_scene_picture_of_an_empty_scene_is_a_picture():
     nothing = np.zeros((0, 3))
     none = np.zeros((0, 4, 4))
-    figure = scene_picture(nothing, nothing, [], nothing, nothing, none, [], none, BOX_VERTICES, BOX_FACES)
+    figure = scene_picture(nothing, nothing, [], nothing, nothing, none, [], none, [BOX_VERTICES], [BOX_FACES])
     assert _pixels(figure).std() > 1
 
 
@@ -67,8 +77,34 @@ def test_scene_picture_rejects_flags_that_do_not_fit_the_poses():
     nothing = np.zeros((0, 3))
     with pytest.raises(ValueError, match="one value for each of the 2 poses, got 1"):
         scene_picture(
-            nothing, nothing, [], nothing, nothing, np.eye(4)[None].repeat(2, 0), [True], [], BOX_VERTICES, BOX_FACES
+            nothing,
+            nothing,
+            [],
+            nothing,
+            nothing,
+            np.eye(4)[None].repeat(2, 0),
+            [True],
+            [],
+            [BOX_VERTICES],
+            [BOX_FACES],
         )
+
+
+def test_every_pose_is_drawn_with_the_mesh_of_its_own_part():
+    nothing, pose = np.zeros((0, 3)), np.eye(4)[None]
+    meshes = [BOX_VERTICES, 2 * BOX_VERTICES], [BOX_FACES, BOX_FACES]
+
+    def extent(parts):
+        figure = scene_picture(nothing, nothing, [], nothing, nothing, pose, [True], [], *meshes, parts)
+        lines = np.concatenate(
+            [s for c in figure.axes[2].collections if hasattr(c, "get_segments") for s in c.get_segments()]
+        )
+        return np.ptp(lines, axis=0)
+
+    np.testing.assert_allclose(extent([1]), 2 * extent([0]))
+    np.testing.assert_allclose(extent(None), extent([0]))
+    with pytest.raises(ValueError, match=r"parts must have one value for each of the 1 poses, got shape \(2,\)"):
+        extent([0, 1])
 
 
 def test_wireframe_of_a_box_seen_along_an_axis_is_the_outline_of_its_face():

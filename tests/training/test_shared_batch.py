@@ -18,6 +18,7 @@ from attentionvote.model import AttentionVote, Neighborhoods
 from attentionvote.part import Part
 from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
 from attentionvote.training.losses import batch_loss
+from attentionvote.training.part_poses import PartPoses
 from attentionvote.training.pose_loss import SymmetricPose
 from attentionvote.training.processes import summed
 from attentionvote.training.synced_norm import RowNormSync
@@ -41,7 +42,11 @@ def scenes_of(batch: Batch, chosen: range) -> Batch:
     return Batch(**{n: getattr(batch, n)[keep] for n in Batch._fields if n != "found"}, found=found)
 
 
-def precise(pose: SymmetricPose) -> SymmetricPose:
+def precise(poses: PartPoses) -> PartPoses:
+    return PartPoses(tuple(map(precise_of_one, poses.each)))
+
+
+def precise_of_one(pose: SymmetricPose) -> SymmetricPose:
     axis = None if pose.axis is None else pose.axis.double()
     return replace(pose, group=pose.group.double(), representation=pose.representation.double(), axis=axis)
 

@@ -6,6 +6,7 @@ Numpy and scipy only. Definitions follow the toolbox of Bregier et al. (2017).
 from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
 from attentionvote.evaluation.average_precision import DetectionScores, average_precision
 from attentionvote.evaluation.bootstrap import Interval, interval, resampled_figures, scene_weights
+from attentionvote.evaluation.by_part import by_part
 from attentionvote.evaluation.matching import Matching, ScoreCurve, match, score_curve
 from attentionvote.evaluation.metric_file import read_metric
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
@@ -17,7 +18,7 @@ from attentionvote.evaluation.result_files import (
     write_results,
 )
 from attentionvote.evaluation.scene_result import Distance, SceneResult
-from attentionvote.evaluation.scores import Curves, curves, evaluate, evaluate_at
+from attentionvote.evaluation.scores import Curves, ap_by_threshold, curves, evaluate, evaluate_at
 
 __all__ = [
     "AverageDistance",
@@ -30,7 +31,9 @@ __all__ = [
     "PoseMetric",
     "SceneResult",
     "ScoreCurve",
+    "ap_by_threshold",
     "average_precision",
+    "by_part",
     "curves",
     "evaluate",
     "evaluate_at",

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from attentionvote.evaluation.average_precision import score_tables
+from attentionvote.evaluation.by_part import by_part
 from attentionvote.evaluation.pose_distance import PoseMetric
 from attentionvote.evaluation.scene_result import Array, SceneResult, distance_tables
 from attentionvote.evaluation.scores import DETAIL_THRESHOLD, THRESHOLDS
-from attentionvote.part import Part
+from attentionvote.part import Parts
 
 LEVEL = 0.95
 _CHUNK = 100  # draws at once: some ten thousand scores each
@@ -42,7 +43,7 @@ def scene_weights(scenes: int, draws: int, seed: int = 0) -> Array:
 
 
 def resampled_figures(
-    scenes: Sequence[SceneResult], part: Part, working_point: float, weights: Array
+    scenes: Sequence[SceneResult], part: Parts, working_point: float, weights: Array
 ) -> dict[str, Array]:
     """Every draw's ``ap_10``, ``ap_5``, ``ap_2``, ``precision_10`` and ``recall_10``, ``(draws,)`` each.
 
@@ -51,7 +52,7 @@ def resampled_figures(
 
     Args:
         scenes: in the order of the weights' columns, with all results.
-        part: gives the pose distance and the diameter.
+        part: gives the pose distance and the diameter; or a set of parts, see ``by_part``.
         working_point: score from which on a result counts as a detection.
         weights: of ``scene_weights``.
 
@@ -60,6 +61,9 @@ def resampled_figures(
     """
     if weights.ndim != 2 or weights.shape[1] != len(scenes):
         raise ValueError(f"weights must be (draws, {len(scenes)}), one column a scene, got {weights.shape}")
+    if len(part.parts) > 1:
+        return by_part(scenes, part, lambda own, one: resampled_figures(own, one, working_point, weights))
+    (part,) = part.parts
     metric = PoseMetric.of(part)
     tables = distance_tables(scenes, metric)
     figures = {}

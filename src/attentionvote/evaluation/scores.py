@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
 from attentionvote.evaluation.average_precision import DetectionScores, score_tables
+from attentionvote.evaluation.by_part import by_part
 from attentionvote.evaluation.matching import Matching, match
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
 from attentionvote.evaluation.scene_result import Array, SceneResult, distance_tables
-from attentionvote.part import Part
+from attentionvote.part import Part, Parts
 
 THRESHOLDS = (0.10, 0.05, 0.02)  # of the diameter
 DETAIL_THRESHOLD = 0.10  # at which recall by visibility and pose errors are reported
@@ -23,7 +24,7 @@ VISIBILITY_EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 def evaluate(
     scenes: Sequence[SceneResult],
-    part: Part,
+    part: Parts,
     thresholds: Sequence[float] = THRESHOLDS,
     add: bool = True,
     metric: PoseMetric | None = None,
@@ -42,20 +43,28 @@ def evaluate(
       edge included (the last bin also holds 100);
     * ``center_error_mm``, ``rotation_error_deg``: medians over the true positives at 10 % D.
 
-    What nothing can be measured on (an empty visibility bin, no true positive) is absent.
+    What nothing can be measured on (an empty visibility bin, no true positive) is absent. Of a set of parts the figures
+    are those of ``by_part``: means over the parts, and each part's own as ``NAME/figure``.
 
     Args:
         scenes: every scene that was processed, also those without results.
-        part: gives diameter, symmetry and model points.
+        part: gives diameter, symmetry and model points; or a set of parts.
         thresholds: fractions of the diameter; fewer are cheaper.
         add: whether to compute the ADD and ADD-S figures, most of the time spent here.
-        metric: pose distance; of the part by default.
+        metric: pose distance; of the part by default. Only for one part.
         occlusion_limit: ground truth occluded up to it (inclusive) must be found.
         result_limit: only this many best results of a scene count; all by default.
 
     Raises:
         ValueError: when there is no scene or no threshold, or a limit is impossible.
     """
+    if len(part.parts) > 1:
+        if metric is not None:
+            raise ValueError(f"a metric belongs to one part, got one with the {len(part.parts)} parts of {part.name}")
+        return by_part(
+            scenes, part, lambda own, one: evaluate(own, one, thresholds, add, None, occlusion_limit, result_limit)
+        )
+    (part,) = part.parts
     if not len(thresholds) or not all(t > 0 for t in thresholds):
         raise ValueError(f"thresholds must be at least one positive fraction of the diameter, got {tuple(thresholds)}")
     tables = distance_tables(scenes, metric or PoseMetric.of(part))
@@ -83,7 +92,7 @@ def evaluate(
     return metrics | recall_by_visibility(scenes, matchings) | pose_errors(scenes, matchings, part)
 
 
-def evaluate_at(scenes: Sequence[SceneResult], part: Part, working_point: float, add: bool = True) -> dict[str, float]:
+def evaluate_at(scenes: Sequence[SceneResult], part: Parts, working_point: float, add: bool = True) -> dict[str, float]:
     """``evaluate`` of a detector with a working point, the score from which on a result counts as a detection.
 
     Average precision is an area over all scores (``ap_N``, ``map_N``, ``f1_N``); everything else, precision and recall
@@ -97,7 +106,7 @@ def evaluate_at(scenes: Sequence[SceneResult], part: Part, working_point: float,
     everything = evaluate(scenes, part, add=False)
     kept = evaluate([scene.above(working_point) for scene in scenes], part, add=add)
     areas = ("ap_", "map_", "f1_")
-    return everything | {k: v for k, v in kept.items() if not k.startswith(areas)}
+    return everything | {k: v for k, v in kept.items() if not k.rpartition("/")[2].startswith(areas)}
 
 
 def recall_by_visibility(scenes: Sequence[SceneResult], matchings: Sequence[Matching]) -> dict[str, float]:
@@ -165,6 +174,13 @@ def curves(
     ap = [score_tables(scenes, tables, t * part.diameter, occlusion_limit, result_limit).ap for t in fractions]
     at_10 = score_tables(scenes, tables, DETAIL_THRESHOLD * part.diameter, occlusion_limit, result_limit)
     return Curves(at_10.curve_precision, at_10.curve_recall, at_10.curve_scores, fractions, np.asarray(ap), at_10)
+
+
+def ap_by_threshold(scenes: Sequence[SceneResult], part: Parts) -> tuple[Array, Array]:
+    """Shares of D from 0 to 10 % in steps of half a per cent, and average precision there; of a set the mean."""
+    own = [[scene.of_part(k) for scene in scenes] for k in range(len(part.parts))] if len(part.parts) > 1 else [scenes]
+    each = [curves(results, one) for results, one in zip(own, part.parts, strict=True)]
+    return each[0].thresholds, np.mean([curve.ap for curve in each], axis=0)
 
 
 def _match_all(

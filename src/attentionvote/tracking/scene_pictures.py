@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -138,23 +139,29 @@ def draw_heat(axes: Axes, points: Array, votes: Array, heat: Array, peaks: Array
 def draw_poses(
     axes: Axes,
     points: Array,
-    wireframe: Wireframe,
-    predicted_poses: Array,
+    predicted: Sequence[tuple[Wireframe, Array]],
     correct: NDArray[np.bool_],
-    gt_poses: Array,
+    truth: Sequence[tuple[Wireframe, Array]],
     view: View,
 ) -> None:
     """The mesh at every pose: truth grey, correct results green, wrong ones red on top."""
     _cloud(axes, points, view)
     groups = [
-        (gt_poses, TRUTH, 1.0, 0.55, 2),
-        (predicted_poses[correct], CORRECT, 1.1, 0.9, 3),
-        (predicted_poses[~correct], WRONG, 1.1, 0.9, 4),
+        (truth, TRUTH, 1.0, 0.55, 2),
+        ([drawn for drawn, right in zip(predicted, correct, strict=True) if right], CORRECT, 1.1, 0.9, 3),
+        ([drawn for drawn, right in zip(predicted, correct, strict=True) if not right], WRONG, 1.1, 0.9, 4),
     ]
-    for poses, colour, width, alpha, layer in groups:
-        if len(poses):
-            lines = np.concatenate([wireframe.segments(pose, view) for pose in poses])
+    for drawn, colour, width, alpha, layer in groups:
+        if drawn:
+            lines = np.concatenate([wireframe.segments(pose, view) for wireframe, pose in drawn])
             axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=width, alpha=alpha, zorder=layer))
+
+
+def _with_meshes(meshes: Sequence[Wireframe], poses: Array, parts: ArrayLike | None) -> list[tuple[Wireframe, Array]]:
+    kinds = np.zeros(len(poses), dtype=np.int64) if parts is None else np.asarray(parts, dtype=np.int64)
+    if kinds.shape != (len(poses),):
+        raise ValueError(f"parts must have one value for each of the {len(poses)} poses, got shape {kinds.shape}")
+    return [(meshes[kind], pose) for kind, pose in zip(kinds, poses, strict=True)]
 
 
 def scene_picture(
@@ -166,8 +173,10 @@ def scene_picture(
     predicted_poses: ArrayLike,
     correct: ArrayLike,
     gt_poses: ArrayLike,
-    vertices: ArrayLike,
-    faces: ArrayLike,
+    vertices: Sequence[ArrayLike],
+    faces: Sequence[ArrayLike],
+    predicted_parts: ArrayLike | None = None,
+    gt_parts: ArrayLike | None = None,
     title: str = "",
 ) -> Figure:
     """Votes, heat and poses of one scene, from the camera (x-y) and from the side (x-z). Lengths in metres.
@@ -181,8 +190,10 @@ def scene_picture(
         predicted_poses: (R, 4, 4) camera_from_part.
         correct: (R,) whether a result counts as correct.
         gt_poses: (I, 4, 4) camera_from_part.
-        vertices: (V, 3) of the part's mesh.
-        faces: (F, 3) of the part's mesh.
+        vertices: (V, 3) of every part's mesh.
+        faces: (F, 3) of every part's mesh.
+        predicted_parts: (R,) which part each result is; all are the first by default.
+        gt_parts: (I,) the same of the truth.
         title: one line above.
 
     Raises:
@@ -197,7 +208,8 @@ def scene_picture(
         raise ValueError(f"heat must have one value for each of the {len(voted)} votes, got {len(hot)}")
     if len(is_correct) != len(found):
         raise ValueError(f"correct must have one value for each of the {len(found)} poses, got {len(is_correct)}")
-    wireframe = Wireframe(vertices, faces)
+    meshes = [Wireframe(*mesh) for mesh in zip(vertices, faces, strict=True)]
+    predicted, true = _with_meshes(meshes, found, predicted_parts), _with_meshes(meshes, truth, gt_parts)
     shown = cloud if len(cloud) else voted
     extent = np.ptp(shown, axis=0) if len(shown) else np.ones(3)
     ratio = np.clip(extent / max(float(extent[0]), 1e-6), 0.15, 1.6)
@@ -208,7 +220,7 @@ def scene_picture(
         titles = ("Votes", "Heat", "Poses") if row == 0 else ("", "", "")
         draw_votes(grid[row, 0], cloud, voted, centers, view)
         draw_heat(grid[row, 1], cloud, voted, hot, peaked, view)
-        draw_poses(grid[row, 2], cloud, wireframe, found, is_correct, truth, view)
+        draw_poses(grid[row, 2], cloud, predicted, is_correct, true, view)
         for axes, text in zip(grid[row], titles, strict=True):
             _view_axes(axes, text, view, shown)
         for axes in grid[row, 1:]:

@@ -14,7 +14,7 @@ from attentionvote.model import Predictions
 def scene_results(
     predictions: Predictions, batch: Batch, peak_threshold: float, confidence_threshold: float = 0.0
 ) -> list[SceneResult]:
-    """Detections and truth of every sample of a batch.
+    """Detections and truth of every sample of a batch; a detection is of the part with the largest logit.
 
     Args:
         predictions: of the batch.
@@ -31,7 +31,9 @@ def scene_results(
     truth = transform(batch.rotation.double().cpu().numpy(), batch.center.double().cpu().numpy())
     real = (batch.center.abs().sum(-1) > 0).cpu().numpy()
     visible = batch.visible.double().cpu().numpy()
+    named, part = predictions.class_logits.float().cpu().numpy().argmax(-1), batch.part.cpu().numpy()
     for i in range(len(poses)):
         occlusion = 1.0 - np.minimum(visible[i, real[i]], 1.0)
-        results.append(SceneResult(poses[i, kept[i]], confidence[i, kept[i]], truth[i, real[i]], occlusion))
+        found = poses[i, kept[i]], confidence[i, kept[i]]
+        results.append(SceneResult(*found, truth[i, real[i]], occlusion, named[i, kept[i]], part[i, real[i]]))
     return results

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from attentionvote.data.samples import Batch
 from attentionvote.model import AttentionVote, Peaks, Poses, Votes
-from attentionvote.part import Part
-from attentionvote.training.pose_loss import RotationLoss, SymmetricPose
+from attentionvote.part import Parts
+from attentionvote.training.part_poses import PartPoses
+from attentionvote.training.pose_loss import RotationLoss
 from attentionvote.training.processes import everyones, rank, summed
 
 QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
@@ -44,10 +45,11 @@ class LossSettings:
     Args:
         rotation: see ``pose_loss``.
         isotropic: share of D added to Lambda in the ``metric`` rotation loss.
-        assignment: a proposal is positive when its centre seed lies within this share of D of an instance.
+        assignment: a proposal is positive when its centre seed lies within this share of an instance's D.
         least_visible: instances with less visible fraction, and invisible ones, are never assigned.
         confidence: ``exponential`` (Eq. 10) or ``quality``: expected share of the thresholds 2, 5 and 10 % D that
-            the pose meets, learned as a probability; proposals that match nothing count as 0.
+            the pose meets, learned as a probability; proposals that match nothing, or whose class is another, count
+            as 0.
         one_per_instance: whether all but the best of several proposals on one instance count as 0 in ``quality``; not
             when the network merges them itself.
         rows_per_scene: most proposals trained on, on average over the batch; an even choice of all.
@@ -73,10 +75,11 @@ class LossSettings:
 class AttentionVoteLoss:
     """All loss terms of one batch; the total is the weighted sum of the terms by name.
 
-    Lengths are divided by 0.1 D, the limit of the evaluation, so that every term is of order one at the limit.
+    Lengths are divided by 0.1 D, the limit of the evaluation, so that every term is of order one at the limit. Where
+    several parts lie in one bin, D and symmetry of every row are those of the part that its instance is.
 
     Args:
-        part: diameter and symmetry.
+        part: diameter and symmetry; or a set of parts.
         weights: weight of each term: ``vote`` (Eq. 1), ``vote_rotation`` (dense supervision: every vote's own
             rotation), ``center``, ``rotation``, ``semantic`` (Eq. 9), ``confidence`` (Eq. 10), ``refined`` (pose
             after the refinement, mean over its steps). A weight of 0 leaves a term out.
@@ -85,14 +88,13 @@ class AttentionVoteLoss:
 
     TERMS = ("vote", "vote_rotation", "center", "rotation", "semantic", "confidence", "refined")
 
-    def __init__(self, part: Part, weights: Mapping[str, float], settings: LossSettings) -> None:
+    def __init__(self, part: Parts, weights: Mapping[str, float], settings: LossSettings) -> None:
         unknown = sorted(set(weights) - set(self.TERMS))
         if unknown:
             raise ValueError(f"loss weights must be among {', '.join(self.TERMS)}, got {', '.join(unknown)}")
         self.weights, self.settings = dict(weights), settings
-        self.unit = 0.1 * part.diameter
-        self.training_pose = SymmetricPose.of(part, settings.isotropic)
-        self.true_pose = SymmetricPose.of(part)
+        self.training_pose = PartPoses.of(part, settings.isotropic)
+        self.true_pose = PartPoses.of(part)
 
     def total(self, terms: Mapping[str, Tensor], ramp: float = 1.0) -> Tensor:
         """Weighted sum; ``ramp`` in [0, 1] scales all terms but the votes' (warm-up)."""
@@ -105,12 +107,13 @@ class AttentionVoteLoss:
         on_part = instance >= 0
         index = instance.clamp(min=0)
         rows = torch.arange(len(index), device=index.device)[:, None]
-        aim = batch.center[rows, index]
-        error = ((votes.xyz - aim).square().sum(-1) + 1e-12).sqrt() / self.unit
+        aim, part = batch.center[rows, index], batch.part[rows, index]
+        error = ((votes.xyz - aim).square().sum(-1) + 1e-12).sqrt() / self._unit(part)
         terms = {"vote": masked_mean(error, on_part)}
         if votes.rotation is not None:
             turn = self.training_pose.rotation_loss(
                 "metric",
+                part.flatten(),
                 votes.rotation.new_zeros(0, 4),
                 votes.rotation.flatten(0, 1),
                 batch.rotation[rows, index].flatten(0, 1),
@@ -119,7 +122,7 @@ class AttentionVoteLoss:
         return terms
 
     def assign(self, peaks: Peaks, batch: Batch, rows: Int[Tensor, " rows"]) -> Assignment:
-        """The nearest visible instance of every proposal (paper, "Assigning instance labels")."""
+        """The nearest visible instance of every proposal, whatever its part (paper, "Assigning instance labels")."""
         sample = rows // peaks.heat.shape[1]
         seed = peaks.center_seed.flatten(0, 1)[rows]
         distance = (seed[:, None] - batch.center[sample]).norm(dim=-1)
@@ -127,18 +130,18 @@ class AttentionVoteLoss:
         # Padding has visibility 0 and lies at the origin.
         distance = distance.masked_fill((visible <= 0) | (visible < self.settings.least_visible), torch.inf)
         nearest, instance = distance.min(dim=1)
-        return Assignment(sample, instance, nearest < self.settings.assignment * 10 * self.unit)
+        limit = self.settings.assignment * self.true_pose.diameter(batch.part[sample, instance])
+        return Assignment(sample, instance, nearest < limit)
 
     def proposal_terms(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
         """Eq. (9) of the positive proposals, term by term, mean over them."""
-        center, rotation = self._truth(assigned, batch)
+        part, center, rotation = self._truth(assigned, batch)
         settings = self.settings
-        apart = ((poses.center - center).square().sum(-1) + 1e-12).sqrt() / self.unit
-        turn = self.training_pose.rotation_loss(settings.rotation, poses.quaternion, poses.rotation, rotation)
+        apart = ((poses.center - center).square().sum(-1) + 1e-12).sqrt() / self._unit(part)
+        turn = self.training_pose.rotation_loss(settings.rotation, part, poses.quaternion, poses.rotation, rotation)
         terms = {"center": masked_mean(apart, assigned.positive), "rotation": masked_mean(turn, assigned.positive)}
         semantic = torch.zeros_like(apart)
         if poses.class_logits.shape[1] > 1:
-            part = batch.part[assigned.sample, assigned.instance]
             semantic = torch.nn.functional.cross_entropy(poses.class_logits, part, reduction="none")
             terms["semantic"] = masked_mean(semantic, assigned.positive)
         if settings.confidence == "exponential":
@@ -151,10 +154,10 @@ class AttentionVoteLoss:
 
     def refined_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> Tensor:
         """Distance after a step of the refinement: centre and rotation together, as the evaluation measures it."""
-        center, rotation = self._truth(assigned, batch)
-        turn = self.training_pose.squared_turn(poses.rotation, rotation)
+        part, center, rotation = self._truth(assigned, batch)
+        turn = self.training_pose.squared_turn(part, poses.rotation, rotation)
         squared = turn + (poses.center - center).square().sum(-1)
-        return masked_mean((squared + 1e-10).sqrt() / self.unit, assigned.positive)
+        return masked_mean((squared + 1e-10).sqrt() / self._unit(part), assigned.positive)
 
     def quality_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
         """Cross entropy between the predicted and the measured quality of every proposal."""
@@ -164,11 +167,18 @@ class AttentionVoteLoss:
         return {"confidence": masked_mean(loss, torch.ones_like(loss, dtype=torch.bool))}
 
     def quality(self, poses: Poses, assigned: Assignment, batch: Batch) -> Float[Tensor, " rows"]:
-        """Share of the thresholds 2, 5, 10 % D that each pose meets; see ``LossSettings.one_per_instance``."""
-        distance = self.true_pose.distance(poses.center, poses.rotation, *self._truth(assigned, batch))
-        distance = distance.masked_fill(~assigned.positive, torch.inf)
-        steps = torch.tensor(QUALITY_STEPS, device=distance.device) * (10 * self.unit)
-        quality = (distance[:, None] < steps).to(poses.score.dtype).mean(1)
+        """Share of the thresholds 2, 5, 10 % D that each pose meets; see ``LossSettings.one_per_instance``.
+
+        With several parts a pose under the name of another part is worth nothing, as in the evaluation.
+        """
+        part, center, rotation = self._truth(assigned, batch)
+        distance = self.true_pose.distance(part, poses.center, poses.rotation, center, rotation)
+        right = assigned.positive
+        if poses.class_logits.shape[1] > 1:
+            right = right & (poses.class_logits.argmax(1) == part)
+        distance = distance.masked_fill(~right, torch.inf)
+        share = distance / self.true_pose.diameter(part)
+        quality = (share[:, None] < torch.tensor(QUALITY_STEPS, device=share.device)).to(poses.score.dtype).mean(1)
         if not self.settings.one_per_instance:
             return quality
         key = assigned.sample * batch.visible.shape[1] + assigned.instance
@@ -176,9 +186,14 @@ class AttentionVoteLoss:
         best = best.scatter_reduce(0, key, distance, "amin")
         return quality * (distance <= best[key])
 
-    def _truth(self, assigned: Assignment, batch: Batch) -> tuple[Tensor, Tensor]:
+    def _truth(self, assigned: Assignment, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Part, centre and rotation of every row's instance."""
         at = assigned.sample, assigned.instance
-        return batch.center[at], batch.rotation[at]
+        return batch.part[at], batch.center[at], batch.rotation[at]
+
+    def _unit(self, part: Int[Tensor, "*rows"]) -> Float[Tensor, "*rows"] | float:
+        """0.1 D of every row's part, metres."""
+        return 0.1 * self.true_pose.diameter(part)
 
 
 def batch_loss(

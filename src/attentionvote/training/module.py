@@ -12,7 +12,7 @@ from torch import Tensor
 from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.model import AttentionVote, Predictions
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY
 from attentionvote.training.detections import scene_results
@@ -22,12 +22,12 @@ from attentionvote.training.schedule import Schedule
 
 
 class PoseTraining(L.LightningModule):
-    """Trains one network for one part.
+    """Trains one network for one part, or for the parts of a set.
 
     Args:
         model: the network.
         loss: its losses.
-        part: for the metrics.
+        part: for the metrics; or the set of parts that the network's classes are.
         schedule: learning rate and warm-up.
         optimizer: ``adam`` (the paper's) or ``adamw``.
         learning_rate, weight_decay: of the optimiser.
@@ -40,7 +40,7 @@ class PoseTraining(L.LightningModule):
         self,
         model: AttentionVote,
         loss: AttentionVoteLoss,
-        part: Part,
+        part: Parts,
         schedule: Schedule,
         optimizer: str = "adam",
         learning_rate: float = 1e-3,
@@ -50,6 +50,10 @@ class PoseTraining(L.LightningModule):
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
+        if model.classes != len(part.parts):
+            raise ValueError(
+                f"model.classes must be the number of parts of {part.name} ({len(part.parts)}), got {model.classes}"
+            )
         self.metadata = dict(metadata or {})
         self.model, self.loss, self.part, self.schedule = model, loss, part, schedule
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
@@ -78,7 +82,10 @@ class PoseTraining(L.LightningModule):
         self.results += self.detect(batch)
 
     def on_validation_epoch_end(self) -> None:
-        """Average precision at 10, 5 and 2 % of the diameter over all validation scenes, those of all processes."""
+        """Average precision at 10, 5 and 2 % of the diameter over all validation scenes, those of all processes.
+
+        Of several parts the mean over the parts, and each part's own.
+        """
         results = processes.in_order(self.results)
         metrics = processes.from_first(evaluate(results, self.part, add=False) if processes.rank() == 0 else {})
         self.log_dict({f"val/{k}": v for k, v in metrics.items()})
@@ -97,7 +104,8 @@ class PoseTraining(L.LightningModule):
 
     def examine(self, batch: Batch) -> list[tuple[SceneResult, ProposalCounts]]:
         """``detect``, and how the proposals cover the instances within the radius of the loss's assignment."""
-        predictions, radius = self.predict(batch), self.loss.settings.assignment * self.part.diameter
+        predictions = self.predict(batch)
+        radius = [self.loss.settings.assignment * part.diameter for part in self.part.parts]
         counts = proposal_counts(predictions, batch, self.peak_threshold, radius)
         return list(zip(scene_results(predictions, batch, self.peak_threshold), counts, strict=True))
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from attentionvote.evaluation import PoseMetric, SceneResult, match
-from attentionvote.part import Part
+from attentionvote.part import Parts
 
 THRESHOLDS = tuple(np.round(np.linspace(0.0, 0.9, 37), 3))
 
@@ -25,21 +25,25 @@ def confident(scenes: Sequence[SceneResult], threshold: float) -> list[SceneResu
     return [scene.above(threshold) for scene in scenes]
 
 
-def best_threshold(scenes: Sequence[SceneResult], part: Part, fraction: float = 0.1) -> float:
+def best_threshold(scenes: Sequence[SceneResult], part: Parts, fraction: float = 0.1) -> float:
     """The confidence threshold with the best F1 at ``fraction`` x D, the lowest of equals.
 
     Args:
         scenes: validation scenes with all detections, so that the test scenes stay unseen.
+        part: their part, or set of parts; D is then that of each, and the detections of all count together.
+        fraction: of D.
     """
-    metric = PoseMetric.of(part)
+    metrics = [PoseMetric.of(one) for one in part.parts]
     best, best_f1 = 0.0, -1.0
     for threshold in candidates(scenes):
         right = wrong = missed = 0
         for scene in confident(scenes, threshold):
-            distances = metric.distances(scene.poses, scene.gt_poses)
-            found = match(distances, scene.scores, scene.to_find(), fraction * part.diameter)
-            right += len(found.true_positives)
-            wrong, missed = wrong + len(found.false_positives), missed + len(found.misses)
+            for k, (one, metric) in enumerate(zip(part.parts, metrics, strict=True)):
+                own = scene.of_part(k)
+                distances = metric.distances(own.poses, own.gt_poses)
+                found = match(distances, own.scores, own.to_find(), fraction * one.diameter)
+                right += len(found.true_positives)
+                wrong, missed = wrong + len(found.false_positives), missed + len(found.misses)
         f1 = 2 * right / max(1, 2 * right + wrong + missed)
         if f1 > best_f1 + 1e-9:
             best, best_f1 = float(threshold), f1

@@ -69,10 +69,14 @@ def picture_inputs(module: PoseTraining, batch: Batch, confidence_threshold: flo
     results = module.detect(batch)
     votes = module.model.cast_votes(batch.points, batch.normals, batch.found)
     peaks = module.model.find_peaks(votes)
-    metric = PoseMetric.of(module.part)
+    parts = module.part.parts
     for i, result in enumerate(results):
-        poses = result.poses[result.scores >= confidence_threshold]
-        distances = metric.distances(poses, result.gt_poses)
+        sure = result.above(confidence_threshold)
+        correct = np.zeros(len(sure.poses), dtype=bool)
+        for k, part in enumerate(parts):
+            own = sure.of_part(k)
+            distances = PoseMetric.of(part).distances(own.poses, own.gt_poses)
+            correct[sure.part_ids == k] = distances.min(axis=1, initial=np.inf) <= 0.1 * part.diameter
         visible = result.gt_occlusion <= 0.5
         yield {
             "points": _array(batch.points[i]),
@@ -80,11 +84,13 @@ def picture_inputs(module: PoseTraining, batch: Batch, confidence_threshold: flo
             "heat": _array(peaks.vote_heat[i]),
             "peaks": _array(peaks.center_seed[i][peaks.heat[i] >= module.peak_threshold]),
             "gt_centers": result.gt_poses[visible, :3, 3],
-            "predicted_poses": poses,
-            "correct": distances.min(axis=1, initial=np.inf) <= 0.1 * module.part.diameter,
+            "predicted_poses": sure.poses,
+            "correct": correct,
             "gt_poses": result.gt_poses[visible],
-            "vertices": module.part.vertices,
-            "faces": module.part.faces,
+            "vertices": [part.vertices for part in parts],
+            "faces": [part.faces for part in parts],
+            "predicted_parts": sure.part_ids,
+            "gt_parts": result.gt_part_ids[visible],
         }
 
 

@@ -38,7 +38,7 @@ class ProposalCounts(NamedTuple):
 
 
 def proposal_counts(
-    predictions: Predictions, batch: Batch, peak_threshold: float, radius: float
+    predictions: Predictions, batch: Batch, peak_threshold: float, radius: float | Sequence[float]
 ) -> list[ProposalCounts]:
     """Counts of every sample of a batch.
 
@@ -49,24 +49,26 @@ def proposal_counts(
         predictions: of the batch.
         batch: with the truth; instances that cannot be seen at all, padded ones among them, are left out.
         peak_threshold: proposals with less heat do not count, nor do places without a peak (heat 0).
-        radius: metres.
+        radius: metres; of several parts one for the instances of each.
     """
     heat, seed = predictions.peak_heat.float().cpu().numpy(), predictions.center_seed.double().cpu().numpy()
     center, visible = batch.center.double().cpu().numpy(), batch.visible.double().cpu().numpy()
+    reach = np.atleast_1d(np.asarray(radius, dtype=np.float64))
+    reach = reach[batch.part.cpu().numpy()] if len(reach) > 1 else np.broadcast_to(reach, visible.shape)
     kept, seen = (heat >= peak_threshold) & (heat > 0), visible > 0
     return [
-        _counts(seed[i, kept[i]], center[i, seen[i]], visible[i, seen[i]] >= LEAST_VISIBLE, radius)
+        _counts(seed[i, kept[i]], center[i, seen[i]], visible[i, seen[i]] >= LEAST_VISIBLE, reach[i, seen[i]])
         for i in range(len(seed))
     ]
 
 
 def _counts(
-    seed: NDArray[np.float64], center: NDArray[np.float64], required: NDArray[np.bool_], radius: float
+    seed: NDArray[np.float64], center: NDArray[np.float64], required: NDArray[np.bool_], reach: NDArray[np.float64]
 ) -> ProposalCounts:
     on = np.zeros(len(center), dtype=np.int64)
     if len(seed) and len(center):
         apart = np.linalg.norm(seed[:, None] - center, axis=-1)
-        near = apart.min(1) < radius
+        near = apart.min(1) < reach[apart.argmin(1)]
         on = np.bincount(apart.argmin(1)[near], minlength=len(center))
     repeats, strays = int(np.maximum(on - 1, 0).sum()), len(seed) - int(on.sum())
     return ProposalCounts(len(seed), int(required.sum()), int((on[required] > 0).sum()), repeats, strays)
