@@ -22,8 +22,8 @@ def run(few_scenes):
     return call
 
 
-def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_brick, tmp_path, capsys):
-    store = f"sqlite:///{tmp_path}/mlflow.db"
+def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_brick, put_tables, tmp_path, capsys):
+    store = put_tables(tmp_path / "mlflow.db")
     with tracking.start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
         pass
     bundle = export_brick("model", training.id)
@@ -52,9 +52,9 @@ def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_
     assert again["figures"]["ap_10"] == result["figures"]["ap_10"]
 
 
-def test_a_run_that_is_gone_costs_a_warning_not_the_figures(run, export_brick, tmp_path, caplog):
+def test_a_run_that_is_gone_costs_a_warning_not_the_figures(run, export_brick, put_tables, tmp_path, caplog):
     export_brick("model", "feed" * 8)
-    result = run(f"tracking.store=sqlite:///{tmp_path}/mlflow.db")
+    result = run(f"tracking.store={put_tables(tmp_path / 'mlflow.db')}")
     assert result["scenes"] == 2
     assert f"not in the training's run, the same command tries again: run {'feed' * 8} must be in sqlite" in caplog.text
 

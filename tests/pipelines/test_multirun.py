@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -169,8 +170,10 @@ def test_no_job_outlives_a_killed_grid(verb: Path) -> None:
 
 
 @pytest.mark.slow
-def test_runs_stand_below_one_parent_that_is_found_again(verb: Path, tmp_path: Path) -> None:
-    store = str(tmp_path / "mlflow.db")
+def test_runs_stand_below_one_parent_that_is_found_again(
+    verb: Path, put_tables: Callable[[Path], str], tmp_path: Path
+) -> None:
+    store = put_tables(tmp_path / "mlflow.db")
     conf = tmp_path / "conf" / "fake.yaml"
     conf.write_text(conf.read_text(encoding="utf-8").replace("store: null", "store: null, parent: null"))
     for part in ("gear", "brick"):  # runs that are there already, as of trainings that are complete
@@ -198,10 +201,10 @@ def test_runs_stand_below_one_parent_that_is_found_again(verb: Path, tmp_path: P
     assert (again.info.run_id, again.info.status, again.data.tags["grid.failed"]) == (parent.info.run_id, "FAILED", "2")
 
 
-def test_the_parent_of_one_part_lives_with_its_runs(tmp_path: Path) -> None:
+def test_the_parent_of_one_part_lives_with_its_runs(put_tables: Callable[[Path], str], tmp_path: Path) -> None:
     import multirun
 
-    store = str(tmp_path / "mlflow.db")
+    store = put_tables(tmp_path / "mlflow.db")
     settings = {"object": {"name": "gear"}, "tracking": {"store": store, "parent": None}}
     jobs = [OmegaConf.create({**settings, "lr": lr}) for lr in (1, 2)]
     opened = []

@@ -25,8 +25,9 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def store(request, tmp_path) -> str:
     """Of SQLite; a test that uses ``database`` runs on every kind."""
-    everywhere = "database" in request.fixturenames
-    return request.getfixturevalue("database") if everywhere else f"sqlite:///{tmp_path}/mlflow.db"
+    if "database" in request.fixturenames:
+        return request.getfixturevalue("database")
+    return request.getfixturevalue("put_tables")(tmp_path / "mlflow.db")
 
 
 @pytest.fixture
