@@ -144,6 +144,21 @@ def test_a_sweep_of_failures_says_why(words: list[str], tmp_path: Path, caplog: 
     assert row["reason"].startswith("outputs=/proc/version/x cannot be written")
 
 
+@pytest.mark.slow
+def test_a_study_that_has_its_total_is_reported_without_a_worker(words: list[str], tmp_path: Path) -> None:
+    job = sweep_of(words)
+    distributions = {s.name: optuna.distributions.FloatDistribution(s.low, s.high, log=True) for s in job.space}
+    for index in range(4):
+        params = {"trainer.learning_rate": 0.002 + 0.001 * index, "loss.weights.vote": 2.0}
+        made = optuna.create_trial(value=0.5 + 0.1 * index, params=params, distributions=distributions)
+        job.ledger.study.add_trial(made)
+    result = run([*words, "trials=4", "executor=ray", "cluster.address=203.0.113.1:6379"])  # where there is no cluster
+    assert result["states"] == {"complete": 4}
+    assert result["best"]["trial"] == 3
+    assert {"trials.png", "best.yaml", "trials.csv"} <= {path.name for path in job.folder.iterdir()}
+    assert (tmp_path / "sweep" / "brick" / "best.yaml").read_text() == (job.folder / "best.yaml").read_text()
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
