@@ -110,7 +110,7 @@ def record(cfg: DictConfig, objects: Sequence[str], scenes: Sequence[str]) -> di
     from hydra.utils import instantiate
     from whole_files import write_whole
 
-    content = OmegaConf.load(RECORDED)
+    content: Any = OmegaConf.load(RECORDED)
     frozen = dict(content.get("frozen", {}))
     for name in objects:
         own = compose("evaluate", [f"object={name}", f"root={cfg.root}", *scenes])

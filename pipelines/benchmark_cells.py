@@ -106,7 +106,7 @@ def baseline_cell(
 
     cfg = compose("evaluate", [f"object={name}", *evaluate])
     part: Part = instantiate(cfg.object)
-    settings = PpfSettings(**ppf, **({} if row.detector == "ppf_icp" else {"icp_iterations": 0}))
+    settings = PpfSettings(**{**ppf, **({} if row.detector == "ppf_icp" else {"icp_iterations": 0})})
     frozen = scenes_of(cfg, part)
     key = hashlib.sha256(json.dumps([asdict(settings), frozen.digest, part.digest]).encode()).hexdigest()
     place = folder / row.detector / f"{name}-{key[:12]}.json"

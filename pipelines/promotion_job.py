@@ -19,7 +19,7 @@ from attentionvote.export import Limits
 from attentionvote.inference import Bundle
 from attentionvote.registry.gates import Evidence, Gate, Rules, judge
 from attentionvote.registry.history import History
-from attentionvote.registry.measurement import EvaluationSet, Measurement
+from attentionvote.registry.measurement import MeasuredScenes, Measurement
 from attentionvote.registry.promotion import Standing, Superseded, move, stand
 from attentionvote.registry.versions import Version, Versions
 
@@ -153,7 +153,7 @@ class PromotionJob:
         version: Version,
         report: Mapping[str, Any] | None = None,
         gates: Sequence[Gate] = (),
-        frozen: EvaluationSet | None = None,
+        frozen: MeasuredScenes | None = None,
     ) -> dict[str, Any]:
         """The dictionary of the JSON line while nothing is moved."""
         champion = self.standing.champion.number if self.standing.champion else None
