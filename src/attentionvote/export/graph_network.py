@@ -19,6 +19,7 @@ from torch._higher_order_ops.scan import scan
 from attentionvote.export.graph_neighbors import farthest_point_order, find_neighborhoods
 from attentionvote.model import AttentionVote, Predictions
 from attentionvote.model.backbone import SetAbstraction
+from attentionvote.model.farthest_votes import FarthestVotes
 from attentionvote.model.point_features import pair_features_reference
 from attentionvote.model.pooled_mlp import pooled_mlp_reference
 from attentionvote.model.refinement import Refined, Refiner
@@ -101,7 +102,7 @@ class GraphRefiner(nn.Module):
         return layer.correct(pooled, center, rotation, context)
 
 
-class GraphFarthestVotes(nn.Module):
+class GraphFarthestVotes(FarthestVotes):
     """``FarthestVotes`` of a batch of one: the farthest-point Scan that also orders the cloud."""
 
     def forward(self, votes: Float[Tensor, "1 votes 3"], count: int) -> Int[Tensor, "1 count"]:
