@@ -67,7 +67,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
                     continue
                 cells[row.name, name] = {"row": row.name, "object": name, **cell}
                 write_json(place, {"table": table.name, "cells": list(cells.values())})
-        if cfg.page is not None:
+        if cfg.page:
             page = Path(cfg.page)
             picture = f"{IMAGES}/{table.name}.png"
             drawn = table.curve is not None and draw(table, table.curve, cells, page.parent / picture)
