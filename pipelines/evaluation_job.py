@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 from hardware import cores
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from several_parts import only_part
 
 from attentionvote.inference import Bundle, load_bundle
 from attentionvote.inference.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_directory, scene_set_specs
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ class EvaluationJob:
     """One bundle to be measured: its part, the key that signed it, what makes the evaluation set."""
 
     cfg: DictConfig
-    part: Part
+    part: Parts
     bundle: Bundle
     key: Ed25519PublicKey
     spec: SceneSetSpec
@@ -45,7 +44,7 @@ class EvaluationJob:
         Raises:
             ValueError: when there is no such bundle, it cannot be trusted, or a setting is impossible.
         """
-        part = only_part(instantiate(cfg.object), "an evaluation")
+        part: Parts = instantiate(cfg.object)
         settings = OmegaConf.to_container(cfg.simulation, resolve=True)
         assert isinstance(settings, dict)
         spec = scene_set_specs(part, settings | {"cycles": {SPLIT: cfg.evaluation.cycles}})[SPLIT]

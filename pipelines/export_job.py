@@ -19,7 +19,6 @@ from hardware import cores
 from hydra.utils import instantiate
 from json_files import read_json, write_json
 from omegaconf import DictConfig
-from several_parts import only_part
 from training_job import MODEL, RESULT
 
 import attentionvote
@@ -32,7 +31,7 @@ from attentionvote.inference.signature import (
     load_private_key,
     make_keys,
 )
-from attentionvote.part import Part
+from attentionvote.part import Parts
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -48,10 +47,10 @@ log = logging.getLogger("attentionvote.export")
 
 @dataclass(frozen=True)
 class ExportJob:
-    """One export: its settings, the part, the training it is of, the key that signs."""
+    """One export: its settings, the part (or set of parts), the training it is of, the key that signs."""
 
     cfg: DictConfig
-    part: Part
+    part: Parts
     training: Path
     trained: dict[str, Any]
     key: Ed25519PrivateKey
@@ -63,7 +62,7 @@ class ExportJob:
         Raises:
             ValueError: when there is no such training, or more than one; or when the key cannot be had.
         """
-        part = only_part(instantiate(cfg.object), "an export")
+        part: Parts = instantiate(cfg.object)
         if cfg.scenes < cfg.limits.scenes:
             raise ValueError(f"scenes must be at least limits.scenes ({cfg.limits.scenes}), got {cfg.scenes}")
         folder = Path(cfg.trained) / part.name

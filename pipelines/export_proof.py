@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from attentionvote.geometry import native
 from attentionvote.inference import BundleError
-from attentionvote.part import Part
+from attentionvote.part import Parts
 
 if TYPE_CHECKING:
     from attentionvote.contract import ModelCard
@@ -25,7 +25,7 @@ _ROUNDS = 7
 
 
 def prove(
-    model: AttentionVote, graph: bytes, card: ModelCard, part: Part, clouds: Clouds, indices: Sequence[int]
+    model: AttentionVote, graph: bytes, card: ModelCard, part: Parts, clouds: Clouds, indices: Sequence[int]
 ) -> tuple[dict[str, Parity], dict[str, float]]:
     """Parity by execution path, and milliseconds a scene of checkpoint and graph, one thread each.
 
@@ -33,7 +33,7 @@ def prove(
         model: the network of the checkpoint.
         graph: the ONNX file.
         card: its card, without figures.
-        part: for distances and symmetries.
+        part: for distances and symmetries; or the set of parts.
         clouds: of the held-out scenes.
         indices: of the scenes to compare.
     """

@@ -21,7 +21,7 @@ UNITS = "m"
 FRAME = "camera: x right, y down, z forward (OpenCV)"
 CARD_KEY = "attentionvote"  # of the card in the graph's metadata_props
 # Came later: absent where it is None, so that older cells read such cards and newer ones read old cards.
-_OPTIONAL = ("voting_radius",)
+_OPTIONAL = ("voting_radius", "parts")
 INPUTS = ("points", "normals")
 
 
@@ -78,7 +78,7 @@ class ModelCard:
     """Everything a cell must know about a model.
 
     Attributes:
-        part: what it looks for.
+        part: what it looks for; of a set of parts its name, digest, the largest diameter and a box that holds them all.
         classes: names of the classes, NC of them.
         points: N, points of the graph's input.
         votes, proposals: M and K of its outputs.
@@ -94,6 +94,7 @@ class ModelCard:
         versions: of the packages that made the graph.
         parity: figures of the proof of equality with the checkpoint.
         evaluation: figures of the test.
+        parts: every part of a set, in the order of the classes; empty where there is one.
 
     Raises:
         ValueError: with one sentence, on values that no model has.
@@ -117,6 +118,7 @@ class ModelCard:
     parity: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Mapping[str, Any] = field(default_factory=dict)
     voting_radius: float | None = None
+    parts: tuple[PartCard, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("points", "votes", "proposals", "density", "normal_neighbors"):
@@ -142,6 +144,10 @@ class ModelCard:
         for name in self.classes:
             _check_text("classes", name)
         object.__setattr__(self, "classes", tuple(self.classes))
+        object.__setattr__(self, "parts", tuple(self.parts))
+        if self.parts and (len(self.parts) < 2 or tuple(part.name for part in self.parts) != self.classes):
+            names = ", ".join(part.name for part in self.parts)
+            raise ValueError(f"card parts must be the classes {', '.join(self.classes)}, two or more, got {names}")
         for name in ("run_id", "commit"):
             _check_text(name, getattr(self, name))
         for name in ("data", "versions", "parity", "evaluation"):
@@ -167,6 +173,11 @@ class ModelCard:
             TensorSpec("confidence", (1, k)),
         )
 
+    @property
+    def each_part(self) -> tuple[PartCard, ...]:
+        """The part of every class."""
+        return self.parts or (self.part,)
+
     def core(self) -> ModelCard:
         """The card without what is measured on the graph: what the graph carries in itself."""
         return replace(self, parity={}, evaluation={})
@@ -175,7 +186,7 @@ class ModelCard:
         """Canonical JSON: the same card, the same text."""
         content = {"contract_version": VERSION, "units": UNITS, "frame": FRAME, **asdict(self)}
         for name in _OPTIONAL:
-            if content[name] is None:
+            if content[name] in (None, ()):
                 del content[name]
         return json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False)
 
@@ -200,7 +211,12 @@ class ModelCard:
                     "export the model again with this version"
                 )
         content = _plain("card", cls, content)
-        return cls(**content | {"part": PartCard(**_plain("card part", PartCard, content["part"]))})
+        content["part"] = PartCard(**_plain("card part", PartCard, content["part"]))
+        if "parts" in content:
+            if not isinstance(content["parts"], list):
+                raise ValueError(f"card parts must be a list of parts, got {content['parts']!r}")
+            content["parts"] = tuple(PartCard(**_plain("card parts", PartCard, part)) for part in content["parts"])
+        return cls(**content)
 
 
 def is_detection(

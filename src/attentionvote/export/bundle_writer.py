@@ -16,7 +16,7 @@ from attentionvote.inference.bundle import Bundle, load_bundle
 from attentionvote.inference.durable import sync
 from attentionvote.inference.golden import clear_confidence, self_test
 from attentionvote.inference.manifest import CARD, GOLDEN, MESH, MODEL, write_manifest
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation.mesh import write_surface
 
 LATEST = "latest"
@@ -26,7 +26,7 @@ _DRAFT, _OLD, _LINK = ".writing-bundle", ".old-bundle", ".writing-link"
 def write_bundle(
     model: bytes,
     card: ModelCard,
-    part: Part,
+    part: Parts,
     clouds: Iterable[tuple[str, NDArray[np.float32]]],
     golden: int,
     key: Ed25519PrivateKey,
@@ -41,7 +41,8 @@ def write_bundle(
     Args:
         model: the ONNX file.
         card: with all figures.
-        part: its mesh, for viewers.
+        part: its mesh, for viewers; of a set the meshes of all, ``part.ply`` being the first part's and the others
+            ``part_NAME.ply``.
         clouds: names and clouds ``(P, 3)`` of scenes that were held out; the first that show clear poses become golden.
         golden: how many of them.
         key: signs the manifest.
@@ -59,7 +60,8 @@ def write_bundle(
         (draft / GOLDEN).mkdir(parents=True)
         (draft / MODEL).write_bytes(model)
         (draft / CARD).write_text(card.to_json(), encoding="utf-8")
-        write_surface(part.vertices, part.faces, draft / MESH)
+        for k, one in enumerate(part.parts):
+            write_surface(one.vertices, one.faces, draft / (MESH if k == 0 else f"part_{one.name}.ply"))
         _write_golden(model, card, clouds, golden, draft)
         write_manifest(draft, key)
         bundle = load_bundle(draft, key.public_key())
@@ -108,12 +110,15 @@ def _write_golden(
             answer = estimator.estimate_parts_only(points)
             if not isinstance(answer, Estimate) or answer.detections[0].confidence < clear:
                 continue  # it would test nothing
-            np.savez(
-                draft / GOLDEN / f"{name}.npz",
-                points=points,
-                camera_from_part=np.stack([d.camera_from_part for d in answer.detections]),
-                confidence=np.array([d.confidence for d in answer.detections], dtype=np.float32),
-            )
+            found = answer.detections
+            arrays: dict[str, NDArray] = {
+                "points": points,
+                "camera_from_part": np.stack([d.camera_from_part for d in found]),
+                "confidence": np.array([d.confidence for d in found], dtype=np.float32),
+            }
+            if card.parts:
+                arrays["part_ids"] = np.array([card.classes.index(d.part) for d in found], dtype=np.int64)
+            np.savez(draft / GOLDEN / f"{name}.npz", **arrays)  # type: ignore[arg-type]
             written += 1
             if written == count:
                 return

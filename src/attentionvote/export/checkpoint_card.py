@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from attentionvote.contract import ModelCard, PartCard
 from attentionvote.model import AttentionVote
-from attentionvote.part import Part
+from attentionvote.part import Parts
 
 _MOST_HEAT = 1.0  # of a farthest vote
 _PACKAGES = ("attentionvote", "torch", "onnx", "onnxscript", "onnxruntime", "numpy", "scipy")
@@ -50,7 +53,7 @@ def used_otherwise(
 def model_card(
     model: AttentionVote,
     metadata: Mapping[str, Any],
-    part: Part,
+    part: Parts,
     distance: tuple[float, float],
     extent: float,
     run_id: str = "",
@@ -61,30 +64,26 @@ def model_card(
     Args:
         model: the network.
         metadata: of its checkpoint, see ``training.checkpoint.load_trained``.
-        part: its part.
+        part: its part, or set of parts.
         distance, extent: of the scenes it was trained for, metres.
         run_id: of the MLflow run.
         commit: of the code that trained it.
 
     Raises:
-        ValueError: when the checkpoint is one of an unfinished training, whose working point is not chosen yet.
+        ValueError: when the checkpoint is one of an unfinished training, whose working point is not chosen yet, or of
+            other parts.
     """
     threshold = metadata["confidence_threshold"]
     if threshold is None:
         raise ValueError("the checkpoint must be of a finished training (model.ckpt), got one without a working point")
-    stored = metadata["part"]
-    low, high = part.vertices.min(0), part.vertices.max(0)
+    stored, parts = metadata["part"], metadata.get("parts", ())
+    if [one.digest for one in part.parts] != [one["digest"] for one in parts or [stored]]:
+        raise ValueError(f"the checkpoint must be of {part.name} as it is now, got one of other parts: train it again")
+    cards = tuple(_part_card(facts, one.box) for facts, one in zip(parts, part.parts, strict=False))
     radius = model.test_voting_radius
     return ModelCard(
-        part=PartCard(
-            name=stored["name"],
-            title=stored["title"],
-            diameter=float(stored["diameter"]),
-            digest=stored["digest"],
-            symmetry=_plain(stored["symmetry"]),
-            box=((float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2]))),
-        ),
-        classes=(stored["name"],),
+        part=_part_card(stored, part.box),
+        classes=tuple(card.name for card in cards) or (stored["name"],),
         points=int(metadata["points"]),
         votes=model.layout.seeds,
         proposals=min(model.proposals, model.layout.seeds),
@@ -99,7 +98,21 @@ def model_card(
         commit=commit,
         versions=package_versions(),
         evaluation={name: float(value) for name, value in metadata["test"].items()},
+        parts=cards,
         voting_radius=None if radius is None or radius == model.voting_radius else float(radius),
+    )
+
+
+def _part_card(facts: Mapping[str, Any], box: NDArray[np.float64]) -> PartCard:
+    """The card of what a checkpoint keeps of a part; a set has no symmetry of its own."""
+    low, high = (tuple(map(float, corner)) for corner in box)
+    return PartCard(
+        name=facts["name"],
+        title=facts["title"],
+        diameter=float(facts["diameter"]),
+        digest=facts["digest"],
+        symmetry=_plain(facts.get("symmetry", {"kind": "none"})),
+        box=(low, high),  # type: ignore[arg-type]  # three numbers each, which the card checks
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from attentionvote.data import Clouds, CloudSettings, collate, draw_sample, measure_clouds
 from attentionvote.data.samples import Batch
 from attentionvote.model import Layout
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation import SceneSet, Sensor
 
 
@@ -21,7 +21,7 @@ def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:
     return CloudSettings(**(stored | {"sensor": Sensor(**stored["sensor"])}))
 
 
-def find_test_scenes(metadata: dict[str, Any], part: Part, root: Path) -> SceneSet:
+def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> SceneSet:
     """The test scenes of a training, below ``root/scenes/PART``.
 
     Args:
@@ -50,7 +50,7 @@ def find_test_scenes(metadata: dict[str, Any], part: Part, root: Path) -> SceneS
     )
 
 
-def measured(scenes: SceneSet, part: Part, settings: CloudSettings, root: Path, workers: int) -> Clouds:
+def measured(scenes: SceneSet, part: Parts, settings: CloudSettings, root: Path, workers: int) -> Clouds:
     """The clouds of the scenes as the training saw them; measured again where they are gone."""
     return measure_clouds(scenes, part, settings, root / "clouds", workers)
 

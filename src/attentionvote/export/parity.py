@@ -18,7 +18,7 @@ from attentionvote.data.samples import Batch
 from attentionvote.evaluation import PoseMetric, SceneResult, evaluate, rotation_errors
 from attentionvote.export.parity_record import NAMES, Parity
 from attentionvote.model import AttentionVote, Predictions
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.training.detections import scene_results
 
 Arrays = Mapping[str, NDArray[np.float32]]
@@ -30,7 +30,7 @@ def measure_parity(
     model: AttentionVote,
     graph: Graph,
     samples: Iterable[Batch],
-    part: Part,
+    part: Parts,
     peak_threshold: float,
     confidence_threshold: float,
 ) -> Parity:
@@ -40,7 +40,7 @@ def measure_parity(
         model: the network of the checkpoint, in evaluation.
         graph: the exported file in its runtime: ``points``, ``normals`` ``(1, N, 3)`` to the outputs by name.
         samples: batches of one, of scenes that were held out.
-        part: for distances and symmetries.
+        part: for distances and symmetries; or the set of parts.
         peak_threshold, confidence_threshold: what counts as a detection.
 
     Raises:
@@ -60,24 +60,30 @@ def measure_parity(
 
 
 def compare(
-    ours: Sequence[SceneResult], theirs: Sequence[SceneResult], part: Part, confidence_threshold: float
+    ours: Sequence[SceneResult], theirs: Sequence[SceneResult], part: Parts, confidence_threshold: float
 ) -> Parity:
     """Differences between two answers to the same scenes.
 
     A detection (confidence at the threshold or above) may find its partner among all proposals of the other side: one
-    that stands a rounding error below the threshold is a partner still.
+    that stands a rounding error below the threshold is a partner still. Of a set of parts, partners have one name.
     """
-    metric = PoseMetric.of(part)
+    metrics = [PoseMetric.of(one) for one in part.parts]
     shift, turn, trust, unmatched = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [0]
-    for a, b in zip(ours, theirs, strict=True):
-        i, j = _partners(metric, a, b, PARTNER * part.diameter)
-        sure_a, sure_b = a.scores >= confidence_threshold, b.scores >= confidence_threshold
-        unmatched.append(int(sure_a.sum() - sure_a[i].sum() + sure_b.sum() - sure_b[j].sum()))
-        kept = sure_a[i] | sure_b[j]
-        i, j = i[kept], j[kept]
-        shift.append(1000 * np.linalg.norm(a.poses[i, :3, 3] - b.poses[j, :3, 3], axis=-1))
-        turn.append(np.degrees(rotation_errors(a.poses[i], b.poses[j], part.symmetry)))
-        trust.append(np.abs(a.scores[i] - b.scores[j]))
+    for whole_a, whole_b in zip(ours, theirs, strict=True):
+        lonely = 0
+        in_scene = [np.zeros(0)]
+        for k, (one, metric) in enumerate(zip(part.parts, metrics, strict=True)):
+            a, b = whole_a.of_part(k), whole_b.of_part(k)
+            i, j = _partners(metric, a, b, PARTNER * one.diameter)
+            sure_a, sure_b = a.scores >= confidence_threshold, b.scores >= confidence_threshold
+            lonely += int(sure_a.sum() - sure_a[i].sum() + sure_b.sum() - sure_b[j].sum())
+            kept = sure_a[i] | sure_b[j]
+            i, j = i[kept], j[kept]
+            in_scene.append(1000 * np.linalg.norm(a.poses[i, :3, 3] - b.poses[j, :3, 3], axis=-1))
+            turn.append(np.degrees(rotation_errors(a.poses[i], b.poses[j], one.symmetry)))
+            trust.append(np.abs(a.scores[i] - b.scores[j]))
+        shift.append(np.concatenate(in_scene))
+        unmatched.append(lonely)
     shifts, turns, trusts = (np.concatenate(values) for values in (shift, turn, trust))
     figures = [evaluate(side, part, add=False) for side in (ours, theirs)]
     return Parity(

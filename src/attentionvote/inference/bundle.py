@@ -52,12 +52,14 @@ class GoldenCloud(NamedTuple):
         points: ``(P, 3)`` float32 metres, camera frame, as a sensor gives it.
         camera_from_part: ``(n, 4, 4)`` float64.
         confidence: ``(n,)`` float32.
+        part_ids: ``(n,)`` int64, index of each pose's class; all 0 where the file says nothing.
     """
 
     name: str
     points: NDArray[np.float32]
     camera_from_part: NDArray[np.float64]
     confidence: NDArray[np.float32]
+    part_ids: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ def _card(folder: Path, content: bytes, model: bytes) -> ModelCard:
     """The card in ``card.json``, which must be the one that the graph carries."""
     try:
         card = ModelCard.from_json(content.decode("utf-8"))
-        Symmetry(**card.part.symmetry)
+        for part in (card.part, *card.parts):
+            Symmetry(**part.symmetry)
     except (ValueError, TypeError) as error:  # TypeError: arguments that no symmetry has
         raise BundleError(f"{folder}: {CARD}: {error}") from error
     try:
@@ -160,8 +163,9 @@ def _golden(name: str, content: bytes) -> GoldenCloud:
             arrays["points"],
             arrays["camera_from_part"],
             arrays["confidence"],
+            arrays.get("part_ids", np.zeros(len(arrays["confidence"]), dtype=np.int64)),
         )
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise BundleError(f"{name} must be a golden cloud, but {error}: export the bundle again") from error
     n = len(cloud.camera_from_part) if cloud.camera_from_part.ndim else 0
     right = (
@@ -172,10 +176,13 @@ def _golden(name: str, content: bytes) -> GoldenCloud:
         and cloud.camera_from_part.shape == (n, 4, 4)
         and cloud.confidence.dtype == np.float32
         and cloud.confidence.shape == (n,)
+        and cloud.part_ids.dtype == np.int64
+        and cloud.part_ids.shape == (n,)
     )
     if not right:
         raise BundleError(
             f"{name} must hold points (P, 3) float32, camera_from_part (n, 4, 4) float64 and confidence (n,) float32, "
+            "of several parts also part_ids (n,) int64, "
             f"got {', '.join(f'{a.shape} {a.dtype}' for a in cloud[1:])}: export the bundle again"
         )
     return cloud

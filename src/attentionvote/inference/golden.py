@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,8 @@ def clear_confidence(threshold: float) -> float:
 def self_test(estimator: PoseEstimator, bundle: Bundle) -> list[str]:
     """What is wrong with the answers to the golden clouds, one sentence each; empty when all are as expected.
 
-    A pose must come back within 1 mm and 1 degree, least over the part's symmetries. Poses whose confidence is near the
-    threshold (below ``clear_confidence``) may come and go: another processor rounds differently.
+    A pose must come back under the same name within 1 mm and 1 degree, least over its part's symmetries. Poses whose
+    confidence is near the threshold (below ``clear_confidence``) may come and go: another processor rounds differently.
 
     Args:
         estimator: of the bundle; its crop is not applied, golden clouds hold parts only.
@@ -36,11 +37,11 @@ def self_test(estimator: PoseEstimator, bundle: Bundle) -> list[str]:
         clouds = bundle.golden()
     except BundleError as error:
         return [str(error)]
-    symmetry = Symmetry(**bundle.card.part.symmetry)
-    return [problem for cloud in clouds for problem in _problems(estimator, cloud, symmetry)]
+    symmetries = [Symmetry(**part.symmetry) for part in bundle.card.each_part]
+    return [problem for cloud in clouds for problem in _problems(estimator, cloud, symmetries)]
 
 
-def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetry: Symmetry) -> list[str]:
+def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetries: Sequence[Symmetry]) -> list[str]:
     try:
         answer = estimator.estimate_parts_only(cloud.points)
     except (InputError, RuntimeError) as error:
@@ -48,7 +49,8 @@ def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetry: Symmetry) 
     detections = answer.detections if isinstance(answer, Estimate) else ()
     poses = np.array([d.camera_from_part for d in detections]).reshape(-1, 4, 4)
     clear = clear_confidence(estimator.card.confidence_threshold)
-    translation, rotation = pose_errors(cloud.camera_from_part, poses, symmetry)
+    named = np.array([estimator.card.classes.index(d.part) for d in detections], dtype=np.int64)
+    translation, rotation = _errors_by_part(cloud, poses, named, symmetries)
     good = (translation <= TRANSLATION_TOLERANCE) & (rotation <= ROTATION_TOLERANCE)
     # The expected poses choose their nearest answers, the clearest first; an answer serves one of them.
     free = np.ones(len(poses), dtype=bool)
@@ -69,10 +71,28 @@ def _problems(estimator: PoseEstimator, cloud: GoldenCloud, symmetry: Symmetry) 
     return problems
 
 
+def _errors_by_part(
+    cloud: GoldenCloud, poses: NDArray[np.float64], named: NDArray[np.int64], symmetries: Sequence[Symmetry]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``pose_errors`` by the symmetry of each expected pose's part; infinite between poses of different parts.
+
+    A bundle without ids, or with a class that no card describes, has one symmetry for all.
+    """
+    if len(symmetries) == 1:
+        return pose_errors(cloud.camera_from_part, poses, symmetries[0])
+    translation = np.full((len(cloud.camera_from_part), len(poses)), np.inf)
+    rotation = translation.copy()
+    for kind, symmetry in enumerate(symmetries):
+        pairs = np.ix_(cloud.part_ids == kind, named == kind)
+        own = cloud.camera_from_part[cloud.part_ids == kind], poses[named == kind]
+        translation[pairs], rotation[pairs] = pose_errors(*own, symmetry)
+    return translation, rotation
+
+
 def _missing(cloud: GoldenCloud, index: int, translation: NDArray[np.float64], rotation: NDArray[np.float64]) -> str:
     said = f"golden cloud {cloud.name} must give pose {index} with confidence {cloud.confidence[index]:.2f} again"
-    if not len(translation):
-        return f"{said}, but gave no pose at all"
+    if not np.isfinite(translation).any():
+        return f"{said}, but gave no pose {'under its name' if len(translation) else 'at all'}"
     nearest = int(np.argmin(translation))
     return (
         f"{said} within 1 mm and 1 degree, but the nearest is off by {1000 * translation[nearest]:.2f} mm "

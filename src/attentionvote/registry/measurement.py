@@ -22,7 +22,7 @@ from attentionvote.evaluation import (
 )
 from attentionvote.evaluation.scene_result import Array
 from attentionvote.inference import Bundle, Estimate, PoseEstimator
-from attentionvote.part import Part
+from attentionvote.part import Parts
 from attentionvote.simulation import PartCaster, SceneRecord, SceneSet
 
 DRAWS = 2000
@@ -33,7 +33,7 @@ class EvaluationSet:
     """Scenes, the part in them, and the sensor that sees them."""
 
     scenes: SceneSet
-    part: Part
+    part: Parts
     settings: CloudSettings
 
     @property
@@ -61,13 +61,13 @@ class Measurement:
     working_point: float
     seconds: Array = field(repr=False)
 
-    def figures(self, part: Part) -> dict[str, float]:
+    def figures(self, part: Parts) -> dict[str, float]:
         """Flat figures: ``evaluation.evaluate_at``, and ``latency_p50_ms``, ``latency_p95_ms``."""
         p50, p95 = (1000 * float(np.percentile(self.seconds, q)) for q in (50, 95))
         found = evaluate_at(self.results, part, self.working_point)
         return found | {"latency_p50_ms": p50, "latency_p95_ms": p95}
 
-    def resampled(self, part: Part, draws: int = DRAWS) -> dict[str, Array]:
+    def resampled(self, part: Parts, draws: int = DRAWS) -> dict[str, Array]:
         """Figures of every bootstrap draw; those of two models on one set belong together draw by draw."""
         return resampled_figures(self.results, part, self.working_point, scene_weights(len(self.results), draws))
 
@@ -118,7 +118,9 @@ def measure(
             detections = answer.detections if isinstance(answer, Estimate) else ()
             poses = np.array([d.camera_from_part for d in detections]).reshape(-1, 4, 4)
             scores = np.array([d.confidence for d in detections])
-            found[which].append(SceneResult(poses, scores, cloud.camera_from_part, occlusion))
+            named = np.array([bundles[which].card.classes.index(d.part) for d in detections], dtype=np.int64)
+            truth = cloud.camera_from_part, occlusion
+            found[which].append(SceneResult(poses, scores, *truth, named, cloud.part_ids))
             seconds[which].append(answer.seconds["total"])
     for estimator in estimators:
         estimator.close()

@@ -98,7 +98,7 @@ def load_trained(path: Path | str) -> tuple[AttentionVote, dict[str, Any]]:
     * ``format``, ``version``: of this file's layout and of the package that wrote it;
     * ``model``: arguments of ``AttentionVote``;
     * ``part``: ``name``, ``title``, ``diameter`` (metres), ``digest``, ``symmetry``;
-    * ``parts``: of a set the same of each part, in the order of the classes; ``part`` is then the set, without symmetry;
+    * ``parts``: of a set the same of each, in the order of the classes; ``part`` is then the set, without symmetry;
     * ``points``: N of a sample; ``clouds``: sensor, density, pool and neighbours of the normals;
     * ``peak_threshold``; ``confidence_threshold``: None before the test;
     * ``data``: digests of the scene sets by split; ``test``: the test's figures, empty before it.
