@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import warnings
 from collections.abc import Iterator
@@ -32,7 +33,7 @@ def export_graph(model: AttentionVote, card: ModelCard) -> bytes:
         ValueError: when the graph does not come out as the card and the contract say.
     """
     points, normals = _example(card.points)
-    with quiet_exporter(), torch.no_grad():
+    with quiet_exporter(), uncollected(), torch.no_grad():
         traced = torch.export.export(ExportNetwork(model).eval(), (points, normals), strict=True)
         program = torch.onnx.export(
             traced,
@@ -71,6 +72,18 @@ def check_graph(graph: onnx.ModelProto, card: ModelCard) -> None:
         found = tuple(_spec(value) for value in actual)
         if found != expected:
             raise ValueError(f"the exported graph must have the {kind} {expected}, got {found}")
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """No garbage collection: a trace makes millions of objects that live to its end, an eighth of its time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @contextmanager
