@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from hardware import cores
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from several_parts import only_part
 
 from attentionvote.inference import Bundle, load_bundle
 from attentionvote.inference.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
@@ -20,22 +21,20 @@ from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_directory, 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-    from attentionvote.registry.measurement import EvaluationSet, Measurement
-    from attentionvote.simulation import SceneRecord
+    from attentionvote.registry.measurement import EvaluationSet, MeasuredScenes, Measurement
+    from attentionvote.scene import Scene
 
 log = logging.getLogger("attentionvote.evaluate")
-SPLIT = "evaluation"  # enters the seeds: no cycle of another split occurs in it
 
 
 @dataclass(frozen=True)
 class EvaluationJob:
-    """One bundle to be measured: its part, the key that signed it, what makes the evaluation set."""
+    """One bundle to be measured: its part, and the key that signed it."""
 
     cfg: DictConfig
     part: Parts
     bundle: Bundle
     key: Ed25519PublicKey
-    spec: SceneSetSpec
 
     @classmethod
     def find(cls, cfg: DictConfig) -> EvaluationJob:
@@ -45,9 +44,7 @@ class EvaluationJob:
             ValueError: when there is no such bundle, it cannot be trusted, or a setting is impossible.
         """
         part: Parts = instantiate(cfg.object)
-        settings = OmegaConf.to_container(cfg.simulation, resolve=True)
-        assert isinstance(settings, dict)
-        spec = scene_set_specs(part, settings | {"cycles": {SPLIT: cfg.evaluation.cycles}})[SPLIT]
+        set_spec(cfg, part)
         Sensor(**cfg.evaluation.sensor)
         key = trusted_key(cfg.trusted_key)
         bundle = load_bundle(_folder(Path(cfg.bundles) / part.name, cfg.bundle, part.name), key)
@@ -56,44 +53,102 @@ class EvaluationJob:
                 f"bundle {bundle.digest[:12]} must be of the part {part.name} as it is now ({part.digest[:12]}), got "
                 f"{bundle.card.part.digest[:12]}: its mesh, diameter or symmetry has changed, train and export it again"
             )
-        return cls(cfg, part, bundle, key, spec)
+        return cls(cfg, part, bundle, key)
 
     @property
     def signer(self) -> str:
         """Fingerprint of the key whose signature the bundle has."""
         return fingerprint(self.key)
 
-    def evaluation_set(self) -> EvaluationSet:
-        """The frozen set, generated when it is not there yet."""
-        from attentionvote.data import CloudSettings
-        from attentionvote.registry.measurement import EvaluationSet
-        from attentionvote.simulation import generate_scene_set
+    def evaluation_set(self) -> MeasuredScenes:
+        """The scenes to measure on, see ``scenes_of``.
 
-        directory = scene_set_directory(Path(self.cfg.root) / "scenes", self.part.name, self.spec)
-        scenes = generate_scene_set(self.part, self.spec, directory, self.cfg.workers or cores())
-        chosen = self.cfg.evaluation
-        settings = CloudSettings(Sensor(**chosen.sensor), density=chosen.density, pool=chosen.density)
-        frozen = EvaluationSet(scenes, self.part, settings)
-        if scenes.digest in self.bundle.card.data.values():
+        Raises:
+            ValueError: when the model was trained with them, or a dataset does not hold the part.
+        """
+        from attentionvote.registry.measurement import EvaluationSet
+
+        scenes = scenes_of(self.cfg, self.part)
+        if isinstance(scenes, EvaluationSet) and scenes.scenes.digest in self.bundle.card.data.values():
             raise ValueError(
-                f"the evaluation set {scenes.digest[:12]} must not be one that the model was trained with, but it is: "
+                f"the evaluation set {scenes.scenes.digest[:12]} must not be one that the model was trained with, but it is: "
                 "change simulation.seed"
             )
-        log.info("%s: evaluation set %s, %d scenes", self.part.name, frozen.digest[:12], len(frozen))
-        return frozen
+        return scenes
 
-    def measure(self, bundles: Sequence[Bundle], frozen: EvaluationSet) -> list[Measurement]:
+    def measure(self, bundles: Sequence[Bundle], frozen: MeasuredScenes) -> list[Measurement]:
         """Measure bundles side by side, with a progress bar."""
         from rich.console import Console
         from rich.progress import track
 
         from attentionvote.registry.measurement import measure
 
-        def shown(records: Sequence[SceneRecord]) -> Iterable[SceneRecord]:
+        def shown(clouds: Iterator[Scene]) -> Iterable[Scene]:
             what = "evaluating" if len(bundles) == 1 else "evaluating candidate and champion"
-            return track(records, f"{self.part.name}: {what}", len(records), console=Console(stderr=True))
+            return track(clouds, f"{self.part.name}: {what}", len(frozen), console=Console(stderr=True))
 
-        return measure(bundles, frozen, self.cfg.evaluation.threads, shown)
+        chosen = self.cfg.evaluation
+        return measure(bundles, frozen, chosen.threads, shown, chosen.peak_threshold)
+
+
+def set_spec(cfg: DictConfig, part: Parts, split: str | None = None, cycles: int | None = None) -> SceneSetSpec:
+    """What determines the frozen set; or cycles of another split of the same simulation.
+
+    Raises:
+        ValueError: when a setting is impossible.
+    """
+    settings = OmegaConf.to_container(cfg.simulation, resolve=True)
+    assert isinstance(settings, dict)
+    split = split or cfg.evaluation.split
+    return scene_set_specs(part, settings | {"cycles": {split: cycles or cfg.evaluation.cycles}})[split]
+
+
+def scenes_of(cfg: DictConfig, part: Parts) -> MeasuredScenes:
+    """The scenes of a dataset when one is named, otherwise the frozen set, generated when it is not there yet.
+
+    Raises:
+        ValueError: when the dataset does not hold the part.
+    """
+    chosen = cfg.evaluation
+    if chosen.dataset is None:
+        return generated_set(cfg, part, set_spec(cfg, part))
+    from dataset_scenes import DatasetScenes
+
+    return DatasetScenes.find(Path(chosen.dataset), only_part(part, "a dataset's scenes"), chosen.density)
+
+
+def generated_set(cfg: DictConfig, part: Parts, spec: SceneSetSpec) -> EvaluationSet:
+    """Generated scenes and the sensor that sees them.
+
+    A frozen set whose digest is recorded in ``evaluation.frozen`` and is another one here is used, and said: physics
+    is a chain of floating-point operations, and a processor or library that rounds otherwise leads to other piles.
+    """
+    from attentionvote.data import CloudSettings
+    from attentionvote.registry.measurement import EvaluationSet
+    from attentionvote.simulation import generate_scene_set
+
+    directory = scene_set_directory(Path(cfg.root) / "scenes", part.name, spec)
+    scenes = generate_scene_set(part, spec, directory, cfg.workers or cores())
+    chosen = cfg.evaluation
+    settings = CloudSettings(Sensor(**chosen.sensor), density=chosen.density, pool=chosen.density)
+    made = EvaluationSet(scenes, part, settings, spec.split)
+    log.info("%s: %s set %s, %d scenes", part.name, spec.split, made.digest[:12], len(made))
+    if is_recorded(cfg, part, made) is False:
+        log.warning(
+            "%s: these scenes are %s, the frozen ones %s: figures of both are not of the same scenes",
+            part.name, scenes.digest[:12], chosen.frozen[part.name][:12],
+        )  # fmt: skip
+    return made
+
+
+def is_recorded(cfg: DictConfig, part: Parts, scenes: MeasuredScenes) -> bool | None:
+    """Whether scenes are those whose digest is recorded; None when none is, or they are of another kind."""
+    from attentionvote.registry.measurement import EvaluationSet
+
+    recorded = cfg.evaluation.frozen.get(part.name)
+    if not recorded or not isinstance(scenes, EvaluationSet) or scenes.split != cfg.evaluation.split:
+        return None
+    return scenes.scenes.digest == recorded
 
 
 def trusted_key(named: str | None) -> Ed25519PublicKey:

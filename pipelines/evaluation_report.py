@@ -6,10 +6,13 @@ import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from evaluation_job import is_recorded
+
 if TYPE_CHECKING:
     from evaluation_job import EvaluationJob
 
-    from attentionvote.registry.measurement import EvaluationSet, Measurement
+    from attentionvote.part import Parts
+    from attentionvote.registry.measurement import MeasuredScenes, Measurement
 
 log = logging.getLogger("attentionvote.evaluate")
 _TITLES = {
@@ -21,16 +24,12 @@ _TITLES = {
 }
 
 
-def described(job: EvaluationJob, frozen: EvaluationSet, measured: Measurement) -> dict[str, Any]:
+def described(job: EvaluationJob, frozen: MeasuredScenes, measured: Measurement) -> dict[str, Any]:
     """What was measured, and on what: the dictionary of the JSON line.
 
-    ``figures`` are those of ``Measurement.figures``; ``intervals`` are ``[low, high]`` of 95 % of the draws.
+    For figures see ``figures_of``; ``frozen`` is whether the scenes are those whose digest is recorded, None without.
     """
-    from attentionvote.registry.measurement import intervals
-    from attentionvote.tracking import provenance
-
-    hardware = provenance.hardware()
-    sure = intervals(measured.resampled(job.part))
+    chosen = job.cfg.evaluation
     return {
         "stage": "evaluate",
         "object": job.part.name,
@@ -38,13 +37,37 @@ def described(job: EvaluationJob, frozen: EvaluationSet, measured: Measurement) 
         "run_id": job.bundle.card.run_id,
         "signed_by": job.signer,
         "evaluation_set": frozen.digest,
+        "frozen": is_recorded(job.cfg, job.part, frozen),
+        "sensor": chosen.sensor.preset if chosen.dataset is None else str(chosen.dataset),
         "scenes": len(frozen),
-        "working_point": measured.working_point,
-        "figures": {name: round(value, 6) for name, value in measured.figures(job.part).items()},
-        "intervals": {name: [round(i.low, 6), round(i.high, 6)] for name, i in sure.items()},
-        "threads": job.cfg.evaluation.threads,
-        "machine": f"{hardware['cpu']}, {hardware['cores']} cores",
+        **figures_of(measured, job.part),
+        "threads": chosen.threads,
+        "machine": machine(),
     }
+
+
+def figures_of(measured: Measurement, part: Parts) -> dict[str, Any]:
+    """``figures`` of ``Measurement.figures``; ``intervals``, ``[low, high]`` of 95 % of the draws; AP by threshold."""
+    from attentionvote.evaluation import ap_by_threshold
+    from attentionvote.registry.measurement import intervals
+
+    thresholds, ap = ap_by_threshold(measured.results, part)
+    sure = intervals(measured.resampled(part))
+    return {
+        "working_point": measured.working_point,
+        "figures": {name: round(value, 6) for name, value in measured.figures(part).items()},
+        "intervals": {name: [round(i.low, 6), round(i.high, 6)] for name, i in sure.items()},
+        "thresholds": [round(float(t), 6) for t in thresholds],
+        "ap_by_threshold": [round(float(value), 6) for value in ap],
+    }
+
+
+def machine() -> str:
+    """The processor, and how many cores of it there are."""
+    from attentionvote.tracking import provenance
+
+    hardware = provenance.hardware()
+    return f"{hardware['cpu']}, {hardware['cores']} cores"
 
 
 def show(result: Mapping[str, Any]) -> None:

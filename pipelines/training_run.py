@@ -29,7 +29,6 @@ from attentionvote import __version__
 from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule
 from attentionvote.model import AttentionVote
 from attentionvote.simulation import Sensor
-from attentionvote.tracking.provenance import git_state
 from attentionvote.tracking.store import connect, resolve_store
 from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
 from attentionvote.training.checkpoint import FORMAT, usable_checkpoint
@@ -129,7 +128,7 @@ class TrainingRun:
                     "data_seconds": round(data_seconds, 1),
                     "train_seconds": round(progress.seconds, 1),
                     "seconds": round(time.monotonic() - start, 1),
-                    "commit": git_state(Path.cwd()).label,
+                    "commit": tracked.commit,
                 }
                 tracked.log_text("result.json", json.dumps(result, indent=2))
                 write_json(self.job.directory / RESULT, result)

@@ -6,8 +6,9 @@ makes its clouds. Several models are measured in one go, scene by scene, so that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -23,18 +24,37 @@ from attentionvote.evaluation import (
 from attentionvote.evaluation.scene_result import Array
 from attentionvote.inference import Bundle, Estimate, PoseEstimator
 from attentionvote.part import Parts
-from attentionvote.simulation import PartCaster, SceneRecord, SceneSet
+from attentionvote.scene import Scene
+from attentionvote.simulation import PartCaster, SceneSet
 
 DRAWS = 2000
 
 
+class MeasuredScenes(Protocol):
+    """Scenes to measure on: ours, generated, or those of somebody else's dataset."""
+
+    @property
+    def part(self) -> Parts:
+        """The part in them."""
+
+    @property
+    def digest(self) -> str:
+        """Same digest, same clouds."""
+
+    def __len__(self) -> int: ...
+
+    def clouds(self) -> Iterator[Scene]:
+        """Every scene as the sensor delivered it, without background."""
+
+
 @dataclass(frozen=True)
 class EvaluationSet:
-    """Scenes, the part in them, and the sensor that sees them."""
+    """Generated scenes, the part in them, the sensor that sees them, and the name of their split."""
 
     scenes: SceneSet
     part: Parts
     settings: CloudSettings
+    split: str = "evaluation"
 
     @property
     def digest(self) -> str:
@@ -43,6 +63,12 @@ class EvaluationSet:
 
     def __len__(self) -> int:
         return len(self.scenes)
+
+    def clouds(self) -> Iterator[Scene]:
+        """Every scene as the sensor delivers it."""
+        caster = PartCaster(self.part)
+        for record in self.scenes.records:
+            yield sense(record, caster, self.settings)[0]
 
 
 @dataclass(frozen=True)
@@ -79,20 +105,22 @@ def intervals(resampled: Mapping[str, Array]) -> dict[str, Interval]:
 
 def measure(
     bundles: Sequence[Bundle],
-    scenes: EvaluationSet,
+    scenes: MeasuredScenes,
     threads: int = 1,
-    shown: Callable[[Sequence[SceneRecord]], Iterable[SceneRecord]] = iter,
+    shown: Callable[[Iterator[Scene]], Iterable[Scene]] = iter,
+    peak_threshold: float | None = None,
 ) -> list[Measurement]:
-    """Measure models side by side: each scene is sensed once and answered by every model, in turning order.
+    """Measure models side by side: each scene is read once and answered by every model, in turning order.
 
     The estimator is the cell's, but for one thing: it is asked for all proposals, because average precision is an area
     over all confidences. Whether one is a detection is decided afterwards, by the same rule.
 
     Args:
         bundles: verified bundles of the set's part.
-        scenes: the evaluation set.
+        scenes: the scenes.
         threads: of an estimate.
         shown: wraps the scenes, such as a progress bar.
+        peak_threshold: heat that a peak needs, in place of what each model asks for.
 
     Raises:
         ValueError: when a bundle is of another part, or an estimator refuses a cloud.
@@ -103,12 +131,10 @@ def measure(
                 f"bundle {bundle.digest[:12]} must be of part {scenes.part.name} {scenes.part.digest[:12]}, got "
                 f"{bundle.card.part.name} {bundle.card.part.digest[:12]}: the part has changed, train it again"
             )
-    caster = PartCaster(scenes.part)
-    estimators = [_all_proposals(bundle, threads) for bundle in bundles]
+    estimators = [_all_proposals(bundle, threads, peak_threshold) for bundle in bundles]
     found: list[list[SceneResult]] = [[] for _ in bundles]
     seconds: list[list[float]] = [[] for _ in bundles]
-    for number, record in enumerate(shown(scenes.scenes.records)):
-        cloud = sense(record, caster, scenes.settings)[0]
+    for number, cloud in enumerate(shown(scenes.clouds())):
         occlusion = 1.0 - np.minimum(cloud.visible_fraction, 1.0)
         for turn in range(len(bundles)):
             which = (number + turn) % len(bundles)
@@ -130,5 +156,8 @@ def measure(
     ]
 
 
-def _all_proposals(bundle: Bundle, threads: int) -> PoseEstimator:
-    return PoseEstimator(replace(bundle, card=replace(bundle.card, confidence_threshold=0.0)), threads=threads)
+def _all_proposals(bundle: Bundle, threads: int, peak_threshold: float | None) -> PoseEstimator:
+    card = replace(bundle.card, confidence_threshold=0.0)
+    if peak_threshold is not None:
+        card = replace(card, peak_threshold=peak_threshold)
+    return PoseEstimator(replace(bundle, card=card), threads=threads)
