@@ -69,10 +69,11 @@ class EvaluationJob:
         from attentionvote.registry.measurement import EvaluationSet
 
         scenes = scenes_of(self.cfg, self.part)
-        if isinstance(scenes, EvaluationSet) and scenes.scenes.digest in self.bundle.card.data.values():
+        made = scenes.scenes.digest if isinstance(scenes, EvaluationSet) else None
+        if made is not None and made in self.bundle.card.data.values():
             raise ValueError(
-                f"the evaluation set {scenes.scenes.digest[:12]} must not be one that the model was trained with, but it is: "
-                "change simulation.seed"
+                f"the evaluation set {made[:12]} must not be one that the model was trained with, but it is: change "
+                "simulation.seed"
             )
         return scenes
 
