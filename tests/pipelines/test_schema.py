@@ -17,12 +17,13 @@ VERBS = sorted(p.stem for p in CONF.glob("*.yaml"))
 def settings(verb: str) -> dict[str, Any]:
     """Every setting of a verb with its default, over every choice of every group (one object stands for all)."""
     named = primary_groups(verb)
-    part = ["object=connecting_rod"] if "object" in named else []
-    part += ["name=bracket", "mesh=bracket.stl"] if verb == "part" else []
-    variants = [[f"{group}={choice}"] for group in sorted(set(named) - {"object"}) for choice in choices(group)]
+    needed = {group: word for group, word in {"object": "connecting_rod", "table": "table_6"}.items() if group in named}
+    more = ["name=bracket", "mesh=bracket.stl"] if verb == "part" else []
+    variants = [{group: choice} for group in sorted(set(named) - {"object"}) for choice in choices(group)]
     found: dict[str, Any] = {}
-    for words in [[], *variants]:
-        for key, value in leaves(OmegaConf.to_container(compose(verb, [*part, *words]))):
+    for chosen in [{}, *variants]:
+        words = [f"{group}={choice}" for group, choice in {**needed, **chosen}.items()]
+        for key, value in leaves(OmegaConf.to_container(compose(verb, [*words, *more]))):
             found[key] = value if found.get(key) is None else found[key]
     return found
 
