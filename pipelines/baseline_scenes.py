@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,7 @@ def ppf_results(
     settings: PpfSettings | None = None,
     workers: int = 1,
     executor: Executor | None = None,
+    shown: Callable[[Iterator[Any]], Iterable[Any]] = iter,
 ) -> tuple[list[SceneResult], NDArray[np.float64]]:
     """What the baseline finds in every scene, and the seconds ``(S,)`` that each took on one thread.
 
@@ -72,6 +74,7 @@ def ppf_results(
         settings: of the detector.
         workers: processes. The results do not depend on it; the times do where they share cores.
         executor: where they are; default this machine.
+        shown: wraps the scenes as they are done, such as a progress bar.
 
     Raises:
         ValueError: when OpenCV with its surface matching is missing, or the executor cannot work here.
@@ -83,10 +86,12 @@ def ppf_results(
     seconds = np.zeros(len(scenes))
     try:
         with closing(run_all(task, scenes, executor, workers=workers)) as results:
-            for index, (detections, elapsed) in results:
+            for index, (detections, elapsed) in shown(results):
                 scene = scenes[index]
                 occlusion = 1.0 - np.minimum(scene.visible_fraction, 1.0)
-                found[index] = SceneResult(*detections, scene.camera_from_part, occlusion)
+                found[index] = SceneResult(
+                    detections.camera_from_part, detections.scores, scene.camera_from_part, occlusion
+                )
                 seconds[index] = elapsed
     except WorkerDied as error:
         raise OSError(

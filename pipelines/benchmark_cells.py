@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,6 @@ from json_files import read_json, write_json
 
 if TYPE_CHECKING:
     from attentionvote.part import Part
-    from attentionvote.scene import Scene
 
 log = logging.getLogger("attentionvote.benchmark")
 _KEPT = (
@@ -31,9 +31,6 @@ _KEPT = (
     "sensor",
     "machine",
 )
-
-# As voted and ranked by OpenCV; registered, and ranked by how well the pose fits, which only then says something.
-_PPF: dict[str, dict[str, Any]] = {"ppf": {"icp_iterations": 0, "score": "votes"}, "ppf_icp": {"score": "fit"}}
 
 
 class CellFailed(Exception):
@@ -97,19 +94,18 @@ def baseline_cell(
     Raises:
         ValueError: when OpenCV is missing, or the scenes cannot be had.
     """
-    from baseline_scenes import ppf_results
+    from baseline_scenes import VARIANTS, ppf_results
     from evaluation_job import generated_set, is_recorded, scenes_of, set_spec
     from evaluation_report import figures_of, machine
     from hydra.utils import instantiate
 
-    from attentionvote.baselines import PpfSettings
     from attentionvote.registry.measurement import Measurement
     from attentionvote.tracking.provenance import git_state
     from attentionvote.training.operating_point import best_threshold
 
     cfg = compose("evaluate", [f"object={name}", *evaluate])
     part: Part = instantiate(cfg.object)
-    settings = PpfSettings(**{**ppf, **_PPF[row.detector]})
+    settings = replace(VARIANTS[row.detector], **ppf)
     frozen = scenes_of(cfg, part)
     key = hashlib.sha256(json.dumps([asdict(settings), frozen.digest, part.digest]).encode()).hexdigest()
     place = folder / row.detector / f"{name}-{key[:12]}.json"
@@ -118,8 +114,12 @@ def baseline_cell(
         return known
     validation = generated_set(cfg, part, set_spec(cfg, part, "val", 1))
     log.info("%s, %s: %d scenes, and %d for its working point", row.name, name, len(frozen), len(validation))
-    chosen, _ = ppf_results(part, _shown(validation.clouds(), len(validation), name), settings, workers)
-    results, seconds = ppf_results(part, _shown(frozen.clouds(), len(frozen), name), settings, workers)
+    found = []
+    for scenes in (validation, frozen):
+        clouds = list(_shown(scenes.clouds(), f"{name}: clouds", len(scenes)))
+        bar = partial(_shown, told=f"{row.name}, {name}", total=len(clouds))
+        found.append(ppf_results(part, clouds, settings, workers, shown=bar))
+    (chosen, _), (results, seconds) = found
     measured = Measurement(row.detector, results, best_threshold(chosen, part), seconds)
     cell = figures_of(measured, part) | {
         "scenes": len(frozen),
@@ -136,8 +136,8 @@ def baseline_cell(
     return cell
 
 
-def _shown(clouds: Any, total: int, name: str) -> list[Scene]:
+def _shown(items: Iterator[Any], told: str, total: int) -> Iterable[Any]:
     from rich.console import Console
     from rich.progress import track
 
-    return list(track(clouds, f"{name}: clouds", total, console=Console(stderr=True)))
+    return track(items, told, total, console=Console(stderr=True))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 VERBS = ("train", "export", "evaluate")
-DETECTORS = ("network", "ppf", "ppf_icp")
+DETECTORS = ("network", "ppf", "ppf_icp", "ppf_icp_fit")
 _KINDS = {"ap": "AP", "add_precision": "ADD precision", "add_recall": "ADD recall"}
 
 
@@ -17,7 +17,8 @@ class Row:
 
     Args:
         name: shown; a row of the paper with this name belongs to it.
-        detector: ``network``, ``ppf`` (point pair features) or ``ppf_icp`` (with its registration).
+        detector: ``network``, ``ppf`` (point pair features), ``ppf_icp`` (with its registration) or ``ppf_icp_fit``
+            (and ranked by how well the pose fits).
         train, export, evaluate: further words of the verbs.
     """
 

@@ -83,7 +83,7 @@ def test_a_row_with_a_value_too_many_is_refused(small: dict[str, Any]) -> None:
 
 
 def test_an_unknown_detector_and_a_name_twice_are_refused(small: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="detector must be one of network, ppf, ppf_icp, got 'icp'"):
+    with pytest.raises(ValueError, match="detector must be one of network, ppf, ppf_icp, ppf_icp_fit, got 'icp'"):
         BenchmarkTable.of("T", {**small, "measured": [{"name": "PPF", "detector": "icp"}]})
     with pytest.raises(ValueError, match="every row must have a name of its own, got ours, ours"):
         BenchmarkTable.of("T", {**small, "measured": [{"name": "ours"}, {"name": "ours"}]})
