@@ -88,26 +88,27 @@ class RealRegistry:
 
 
 @contextmanager
-def running_registry(folder: Path) -> Iterator[RealRegistry]:
-    """A server on a store in a folder."""
+def running_registry(store: str) -> Iterator[RealRegistry]:
+    """A server on a store."""
     from attentionvote.tracking.server import serve
 
-    with serve(f"sqlite:///{folder}/mlflow.db") as server:
+    with serve(store) as server:
         yield RealRegistry(server.url, server.store, server.process)
 
 
 @pytest.fixture(scope="session")
-def real_registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealRegistry]:
+def real_registry(
+    put_tables: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[RealRegistry]:
     """A server that the tests of a session share: each has models of its own in it."""
-    with running_registry(tmp_path_factory.mktemp("registry")) as registry:
+    with running_registry(put_tables(tmp_path_factory.mktemp("registry") / "mlflow.db")) as registry:
         yield registry
 
 
 @pytest.fixture
-def own_registry(tmp_path: Path) -> Iterator[RealRegistry]:
+def own_registry(put_tables: Callable[[Path], str], tmp_path: Path) -> Iterator[RealRegistry]:
     """A server of this test alone, which may kill it."""
-    (tmp_path / "registry").mkdir()
-    with running_registry(tmp_path / "registry") as registry:
+    with running_registry(put_tables(tmp_path / "registry" / "mlflow.db")) as registry:
         yield registry
 
 

@@ -86,9 +86,9 @@ class Customer:
 
 @pytest.mark.slow
 def test_a_running_cell_follows_promotion_and_rollback_and_outlives_the_registry(
-    export_brick, make_cloud, few_scenes, easy_gates, work_tree, tmp_path
+    export_brick, make_cloud, few_scenes, easy_gates, work_tree, put_tables, tmp_path
 ):
-    local = f"sqlite:///{tmp_path}/registry/mlflow.db"
+    local = put_tables(tmp_path / "registry" / "mlflow.db")
     with serve(local) as server:
 
         def made_by_a_training(name: str):

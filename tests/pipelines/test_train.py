@@ -25,6 +25,7 @@ import torch
 import train
 from configuration import ConfigurationError, compose
 from scipy.spatial import ConvexHull
+from tiny_training import TINY_TRAINING
 
 from attentionvote import tracking
 from attentionvote.part import Part
@@ -32,17 +33,9 @@ from attentionvote.simulation import scene_set
 from attentionvote.tracking import figures, scene_pictures
 
 ROOT = Path(__file__).resolve().parents[2]
-NETWORK = [
-    "model.centers=[64,32,16,8]", "model.neighbors=[8,8,8,8]", "model.widths=[[8,16],[16,16],[16,16],[16,16]]",
-    "model.propagation=[16,16]", "model.voting=[16]", "model.fusion=[16,16]", "model.head=[16]",
-    "model.refinement.points=16", "model.refinement.widths=[8,16]", "model.refinement.head=[16]",
-]  # fmt: skip
 TINY = [
-    "object=brick", "experiment=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2]", "workers=1",
-    "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=6",
-    "trainer.validate_every=2", "trainer.threads=1", "trainer.average_decay=0.5", "trainer.precision=32-true",
-    "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1", "trainer.schedule.ramp_steps=1",
-    "tracking.system_interval=0", "force=false", *NETWORK,
+    "object=brick", *TINY_TRAINING, "simulation.drop_counts=[1,2]", "workers=1", "trainer.max_epochs=6",
+    "trainer.validate_every=2", "trainer.average_decay=0.5", "force=false",
 ]  # fmt: skip
 
 
@@ -60,10 +53,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = str(tmp_path_factory.mktemp("tracking") / "mlflow.db")
-    tracking.start_run(path, "warm", system_interval_s=0).close()  # the tables take seconds
-    return path
+def store(put_tables: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("tracking") / "mlflow.db"
+    put_tables(path)
+    return str(path)
 
 
 @pytest.fixture
@@ -320,7 +313,9 @@ def until(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @CHEAP
-def test_killed_anywhere_and_continued_ends_the_same(words: list[str], tmp_path: Path, store: str, verb: Verb) -> None:
+def test_killed_anywhere_and_continued_ends_the_same(
+    words: list[str], tmp_path: Path, store: str, verb: Verb, caplog: pytest.LogCaptureFixture
+) -> None:
     words = [*words, "trainer.max_epochs=16", "trainer.validate_every=8"]
     whole = run(words, f"outputs={tmp_path}/whole")
     killed_at = []
@@ -333,14 +328,13 @@ def test_killed_anywhere_and_continued_ends_the_same(words: list[str], tmp_path:
         process.communicate()
         killed_at.append(torch.load(last, weights_only=True)["global_step"])
     run_id = json.loads((job_folder(tmp_path) / "run.json").read_text())["run_id"]
-    process = verb([*words, "data.workers=1"])
-    out, err = process.communicate(timeout=250)
-    assert process.returncode == 0, err
-    result = json.loads(out)
+    # To the end in this process, which has imported everything already.
+    with caplog.at_level(logging.INFO, logger="attentionvote"):
+        result = run(words, "data.workers=1")
     assert 0 < killed_at[0] < killed_at[1] < 32
     assert (result["steps"], result["run_id"]) == (32, run_id)
-    assert "going on after an interruption" in err
-    assert "Traceback" not in err
+    assert "going on after an interruption" in caplog.text
+    assert "Traceback" not in caplog.text
     for name, value in weights(whole).items():
         assert torch.equal(value, weights(result)[name]), name
     assert result["metrics"] == whole["metrics"]

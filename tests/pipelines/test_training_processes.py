@@ -19,21 +19,16 @@ from typing import Any
 import pytest
 import train
 from configuration import ConfigurationError, compose
+from tiny_training import TINY_TRAINING
 from training_processes import Place, first_speaks, refuse_grid
 
 ROOT = Path(__file__).resolve().parents[2]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
 # rounding then stay what they are for a while.
 WORDS = [
-    "object=brick", "experiment=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2,3]", "workers=1",
-    "data.density=1500", "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=4",
-    "trainer.validate_every=2", "trainer.threads=1", "trainer.average_decay=0.5", "trainer.precision=32-true",
-    "trainer.accelerator=cpu", "trainer.schedule.vote_steps=1", "trainer.schedule.ramp_steps=1", "force=false",
-    "trainer.learning_rate=0.001", "trainer.peak_threshold=0.0", "trainer.train_heat=0.0",
-    "loss.settings.assignment=0.6", "tracking.system_interval=0", "model.centers=[64,32,16,8]",
-    "model.neighbors=[8,8,8,8]", "model.widths=[[8,16],[16,16],[16,16],[16,16]]", "model.propagation=[16,16]",
-    "model.voting=[16]", "model.fusion=[16,16]", "model.head=[16]", "model.refinement.points=16",
-    "model.refinement.widths=[8,16]", "model.refinement.head=[16]",
+    "object=brick", *TINY_TRAINING, "simulation.drop_counts=[1,2,3]", "workers=1", "trainer.max_epochs=4",
+    "trainer.validate_every=2", "trainer.average_decay=0.5", "force=false", "trainer.learning_rate=0.001",
+    "trainer.peak_threshold=0.0", "trainer.train_heat=0.0", "loss.settings.assignment=0.6",
 ]  # fmt: skip
 TORCHRUN_SAYS = {
     "RANK": "1", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "none"
@@ -236,7 +231,7 @@ def assert_same_training(one: dict[str, Any], other: dict[str, Any], database: P
 
 
 def until(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 240
     while not ready():
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
@@ -253,9 +248,10 @@ def child_of_rank(torchrun: int, rank: int) -> int:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_two_processes_train_what_one_trains_whatever_interrupts_them(
-    start: Start, alone: Callable[[list[str]], dict[str, Any]], tmp_path: Path
+    start: Start, alone: Callable[[list[str]], dict[str, Any]], put_tables: Callable[[Path], str], tmp_path: Path
 ) -> None:
     database = tmp_path / "mlflow.db"
+    put_tables(database)
     common = [*WORDS, f"root={tmp_path / 'data'}", f"tracking.store={database}"]
     process = start(2, [*common, f"outputs={tmp_path / 'two'}"])  # the first process makes the data
     out, err = process.communicate(timeout=250)

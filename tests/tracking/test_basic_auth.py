@@ -56,7 +56,7 @@ class Guarded:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory, repository):
+def server(put_tables, tmp_path_factory, repository):
     """MLflow with the rights of docker/basic_auth.ini, on SQLite."""
     folder = tmp_path_factory.mktemp("guarded")
     (folder / "admin_password").write_text(secrets.token_hex(12))
@@ -74,7 +74,7 @@ def server(tmp_path_factory, repository):
     }
     port = free_port()
     words = ["--host", "127.0.0.1", "--port", str(port), "--workers", "1", "--app-name", "basic-auth"]
-    words += ["--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--artifacts-destination", str(folder / "files")]
+    words += ["--backend-store-uri", put_tables(folder / "mlflow.db"), "--artifacts-destination", str(folder / "files")]
     guarded = Guarded(f"http://127.0.0.1:{port}", folder, folder / "log")
     with guarded.log.open("w") as log:
         process = subprocess.Popen(

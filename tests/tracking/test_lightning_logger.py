@@ -2,8 +2,10 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
+import warnings
 from argparse import Namespace
 from pathlib import Path
 from types import SimpleNamespace
@@ -95,11 +97,8 @@ def test_end_of_fit_does_not_end_the_run(store, logger):
 
 @pytest.mark.slow
 def test_training_killed_and_started_again_is_one_run_with_contiguous_metrics(store, tmp_path):
-    def start(run_id, epochs):
-        command = [sys.executable, str(SCRIPT), store, run_id, str(tmp_path / "ckpt"), str(epochs)]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    with start("-", 1000) as process:
+    command = [sys.executable, str(SCRIPT), store, "-", str(tmp_path / "ckpt"), "1000"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         run_id = process.stdout.readline().strip()
         while process.stdout.readline().strip() not in ("5", ""):
@@ -107,9 +106,9 @@ def test_training_killed_and_started_again_is_one_run_with_contiguous_metrics(st
         process.kill()
     client = connect(store)
     assert client.get_run(run_id).info.status == "RUNNING"
-    with start(run_id, 9) as process:
-        _, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
+    with warnings.catch_warnings():  # of Lightning and torch, about a loader without workers
+        warnings.simplefilter("ignore")
+        runpy.run_path(str(SCRIPT))["main"](store, run_id, tmp_path / "ckpt", 9)  # this process has all the imports
     runs = client.search_runs([client.get_run(run_id).info.experiment_id])
     assert [(r.info.run_id, r.info.status) for r in runs] == [(run_id, "FINISHED")]
     for name, count in {"train/loss": 9 * 20, "val/loss": 9, "val/ap_10": 9}.items():

@@ -16,8 +16,8 @@ from attentionvote.tracking.store import connect
 
 
 @pytest.mark.slow
-def test_run_on_a_server_with_artefacts_an_outage_and_a_resume(tmp_path, caplog, capfd):
-    store = f"sqlite:///{tmp_path}/mlflow.db"
+def test_run_on_a_server_with_artefacts_an_outage_and_a_resume(put_tables, tmp_path, caplog, capfd):
+    store = put_tables(tmp_path / "mlflow.db")
     checkpoint = tmp_path / "last.ckpt"
     checkpoint.write_bytes(b"weights" * 1000)
     with serve(store) as server:
