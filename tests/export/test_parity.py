@@ -18,7 +18,7 @@ from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.model import AttentionVote, find_neighborhoods
 from attentionvote.part import Part
 
-LIMITS = Limits(0.1, 0.01, 0.1, 0.01, 0.01, 0, 0.002, scenes=2)
+LIMITS = Limits(0.1, 0.01, 0.1, 0.01, 0.01, 0.001, 0, 0.002, scenes=2)
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -72,6 +72,19 @@ def test_a_partner_just_below_the_threshold_is_a_partner(part: Part) -> None:
     assert (both_below.pairs, both_below.unmatched) == (0, 0)
 
 
+def test_one_jump_in_a_hundred_is_the_largest_difference_and_not_the_percentile(part: Part) -> None:
+    places = np.arange(101) * 0.3
+    jumped = np.full(101, 0.9)
+    jumped[7] = 0.75
+    parity = compare([scene(poses(*places), np.full(101, 0.9))], [scene(poses(*places), jumped)], part, 0.5)
+    assert (parity.pairs, parity.unmatched) == (101, 0)
+    assert parity.confidence == pytest.approx(0.15)
+    assert parity.confidence_p99 == pytest.approx(0.0)
+    jumped[8] = 0.75
+    twice = compare([scene(poses(*places), np.full(101, 0.9))], [scene(poses(*places), jumped)], part, 0.5)
+    assert twice.confidence_p99 > 0.1
+
+
 def test_average_precision_is_that_of_all_confidences(part: Part) -> None:
     parity = compare([scene(poses(0.0, 0.2, 0.4), [0.9, 0.8, 0.1])], [scene(poses(0.0), [0.9])], part, 0.5)
     assert parity.ap["ap_10"][0] == pytest.approx(1.0)
@@ -89,12 +102,13 @@ def test_average_precision_is_that_of_all_confidences(part: Part) -> None:
         ({"translation_p99_mm": 0.011}, "translation_p99_mm must be at most 0.01, got 0.011"),
         ({"rotation_degrees": 0.2}, "rotation_degrees must be at most 0.1, got 0.2"),
         ({"rotation_p99_degrees": 0.02}, "rotation_p99_degrees must be at most 0.01, got 0.02"),
+        ({"confidence_p99": 0.002}, "confidence_p99 must be at most 0.001, got 0.002"),
         ({"confidence": float("nan")}, "confidence must be at most 0.01, got nan"),
         ({"ap": {"ap_5": (0.5, 0.4979)}}, "ap_5 must agree within 0.002, got 0.5000 and 0.4979"),
     ],
 )
 def test_every_broken_limit_has_its_sentence(change: dict, words: str) -> None:
-    at_the_limit = Parity(2, 5, 0, 0.1, 0.01, 0.1, 0.01, 0.01, {"ap_10": (0.9, 0.9019)})
+    at_the_limit = Parity(2, 5, 0, 0.1, 0.01, 0.1, 0.01, 0.01, 0.001, {"ap_10": (0.9, 0.9019)})
     assert at_the_limit.violations(LIMITS) == []
     broken = replace(at_the_limit, **change).violations(LIMITS)
     assert len(broken) == 1
@@ -102,7 +116,9 @@ def test_every_broken_limit_has_its_sentence(change: dict, words: str) -> None:
 
 
 def test_the_table_has_a_column_for_every_path() -> None:
-    parity = Parity(32, 5, 0, 0.1, 0.01, 0.1, 0.01, 0.01, dict.fromkeys(("ap_10", "ap_5", "ap_2"), (0.9, 0.8999)))
+    parity = Parity(
+        32, 5, 0, 0.1, 0.01, 0.1, 0.01, 0.01, 0.001, dict.fromkeys(("ap_10", "ap_5", "ap_2"), (0.9, 0.8999))
+    )
     lines = list(table({"CPU": parity, "CUDA": parity}, LIMITS))
     assert "CPU" in lines[0]
     assert "CUDA" in lines[0]

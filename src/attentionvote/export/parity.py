@@ -95,6 +95,7 @@ def compare(
         rotation_degrees=float(turns.max(initial=0.0)),
         rotation_p99_degrees=_percentile(turns),
         confidence=float(trusts.max(initial=0.0)),
+        confidence_p99=_percentile(trusts),
         ap={name: (float(figures[0][name]), float(figures[1][name])) for name in NAMES},
         worst_scene=int(np.argmax([values.max(initial=0.0) for values in shift[1:]])) if ours else 0,
         unmatched_scenes=tuple(i for i, count in enumerate(unmatched[1:]) if count),

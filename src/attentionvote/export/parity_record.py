@@ -16,7 +16,7 @@ class Limits:
 
     Args:
         translation_mm, rotation_degrees, confidence: largest difference of a matched pair.
-        translation_p99_mm, rotation_p99_degrees: 99th percentile of all matched pairs.
+        translation_p99_mm, rotation_p99_degrees, confidence_p99: 99th percentile of all matched pairs.
         unmatched: detections without a partner, both sides together.
         ap: average precision at 10, 5 and 2 % of D.
         scenes: least number of scenes for a proof.
@@ -27,6 +27,7 @@ class Limits:
     rotation_degrees: float
     rotation_p99_degrees: float
     confidence: float
+    confidence_p99: float
     unmatched: int
     ap: float
     scenes: int
@@ -49,6 +50,7 @@ class Parity:
     rotation_degrees: float
     rotation_p99_degrees: float
     confidence: float
+    confidence_p99: float
     ap: Mapping[str, tuple[float, float]]
     worst_scene: int = 0
     unmatched_scenes: tuple[int, ...] = ()
@@ -62,7 +64,7 @@ class Parity:
             broken.append("at least one detection must be compared, got none: the model finds nothing in these scenes")
         for name in (
             "translation_mm", "translation_p99_mm", "rotation_degrees", "rotation_p99_degrees", "confidence",
-            "unmatched",
+            "confidence_p99", "unmatched",
         ):  # fmt: skip
             value, limit = getattr(self, name), getattr(limits, name)
             if not value <= limit:
@@ -115,6 +117,7 @@ def table(parity: Mapping[str, Parity], limits: Limits) -> Iterator[str]:
         ("rotation, p99 (degrees)", [f"{p.rotation_p99_degrees:.4f}" for p in parity.values()],
          f"{limits.rotation_p99_degrees:g}"),
         ("confidence, max", [f"{p.confidence:.5f}" for p in parity.values()], f"{limits.confidence:g}"),
+        ("confidence, p99", [f"{p.confidence_p99:.5f}" for p in parity.values()], f"{limits.confidence_p99:g}"),
     ]  # fmt: skip
     for name in NAMES:
         cells = ["{:.4f} | {:.4f}".format(*p.ap[name]) for p in parity.values()]
