@@ -148,6 +148,31 @@ def states_of(folder: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
+def test_on_ray_every_end_comes_back_and_a_killed_sweep_goes_on(tmp_path: Path, does: Does, start: Start) -> None:
+    does({0: "prune", 1: "end its worker once", 2: "wait", 3: "crash once"})
+    process = start("ray", 4)
+    until(lambda: (tmp_path / "logs" / "trial_003.log").exists(), process)
+    until(lambda: states_of(tmp_path) == ["PRUNED", "COMPLETE", "RUNNING", "COMPLETE"], process)
+    process.kill()
+    process.communicate()
+    until(lambda: not any(runs(note[1]) for note in notes(tmp_path)), within_s=60)  # no training outlives the sweep
+    does({4: "fail"})
+    process = start("ray", 5)
+    _, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err
+    ledger = Ledger(open_study(f"sqlite:///{tmp_path}/study.db", "s", 60), [], 0, 2, tmp_path)
+    assert [trial.state.name for trial in ledger.trials] == ["PRUNED", "COMPLETE", "COMPLETE", "COMPLETE", "FAIL"]
+    assert ledger.trials[4].user_attrs["reason"] == "the cloud must be finite, got 3 NaN"
+    assert [trial.user_attrs.get("crashes", 0) for trial in ledger.trials] == [0, 1, 0, 1, 0]
+    numbers = sorted(note[0] for note in notes(tmp_path))
+    assert numbers == ["0", "1", "1", "2", "2", "3", "3", "4"]
+    assert len({(note[0], note[3]) for note in notes(tmp_path)}) == 5  # a number has one set of parameters
+    assert {note[4] for note in notes(tmp_path)} == {"secret"}
+    assert all("epoch 1" in log_of(tmp_path / "logs", n).read_text() for n in range(5))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_through_submitted_jobs_and_no_training_outlives_what_waits_for_it(
     tmp_path: Path, does: Does, start: Start
 ) -> None:
