@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from command import Refused, command, configuring
-from configuration import CONF, ConfigurationError, compose, parse
+from configuration import CONF, ConfigurationError, compose, parse, sentence
 from fleet import words_of_verbs
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_hardware
@@ -45,28 +45,33 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     with configuring():
         table = BenchmarkTable.of(table_name(words), plain)
         objects, rows = table.chosen(cfg.objects, cfg.rows)
-    training, scenes = training_words(words), scene_words(words)
     if cfg.record:
-        return record(cfg, objects, scenes)
+        return record(cfg, objects)
     folder = Path(cfg.benchmarks)
     with locked_folder(folder, cfg.benchmarks, "benchmark", "benchmarks"):
         place = folder / f"{table.name}.json"
-        stored = read_json(place) or {}
+        # Without a page nothing of earlier calls is shown, and nothing of this one is kept for later ones.
+        stored = (read_json(place) or {}) if cfg.page else {}
         cells = {(cell["row"], cell["object"]): cell for cell in stored.get("cells", [])}
         failures: dict[str, str] = {}
+        left_out: dict[str, str] = {}
         for row in rows:
             for name in objects:
                 try:
-                    cell = _measure(cfg, training, scenes, row, name)
-                except CellFailed as error:
-                    failures[f"{row.name}, {name}"] = str(error)
-                    log.warning("%s, %s: %s", row.name, name, error)
+                    with configuring():
+                        cell = _measure(cfg, words, row, name)
+                except (CellFailed, ConfigurationError) as error:
+                    # A part without a mesh, say, is no failure where nobody asked for it by name.
+                    unasked = isinstance(error, ConfigurationError) and cfg.objects is None
+                    (left_out if unasked else failures)[f"{row.name}, {name}"] = sentence(error)
+                    log.warning("%s, %s: %s", row.name, name, sentence(error))
                     continue
                 if cell is None:
                     log.info("%s, %s: not run (train=true trains it)", row.name, name)
                     continue
                 cells[row.name, name] = {"row": row.name, "object": name, **cell}
-                write_json(place, {"table": table.name, "cells": list(cells.values())})
+                if cfg.page:
+                    write_json(place, {"table": table.name, "cells": list(cells.values())})
         if cfg.page:
             page = Path(cfg.page)
             picture = f"{IMAGES}/{table.name}.png"
@@ -78,6 +83,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         "table": table.name,
         "cells": [cells[key] for key in cells],
         "failures": failures,
+        "left_out": left_out,
         "page": cfg.page,
     }
     if failures:
@@ -86,26 +92,26 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     return result
 
 
-def _measure(
-    cfg: DictConfig, training: Sequence[str], scenes: Sequence[str], row: Row, name: str
-) -> dict[str, Any] | None:
+def _measure(cfg: DictConfig, words: Sequence[str], row: Row, name: str) -> dict[str, Any] | None:
     from benchmark_cells import baseline_cell, network_cell
     from hardware import cores
 
-    here = cfg.copy()
-    here.export, here.evaluate = [*cfg.export, *row.export], [*scenes, *cfg.evaluate, *row.evaluate]
-    with configuring():
-        words, _ = words_of_verbs(here, [*training, *row.train], name)
+    here, own = cfg.copy(), Path(cfg.benchmarks)
+    part = words_of("object", words)
+    # What a benchmark exports is nobody's newest model.
+    here.export = [f"outputs={own / 'export'}", *part, *cfg.export, *row.export]
+    here.evaluate = [f"outputs={own / 'evaluate'}", *part, *scene_words(words), *cfg.evaluate, *row.evaluate]
     if row.detector == "network":
-        return network_cell(words, name, cfg.train)
+        verbs, _ = words_of_verbs(here, [*training_words(words, cfg.train), *row.train], name)
+        return network_cell(verbs, name, cfg.train)
     # Where bundles lie and who signed them is nothing to the baseline.
-    on = [f"root={cfg.root}", *here.evaluate]
+    on = [f"root={cfg.root}", *here.evaluate, *(["force=true"] if cfg.force else [])]
     ppf: Any = OmegaConf.to_container(cfg.ppf)
-    return baseline_cell(on, name, row, Path(cfg.benchmarks), cfg.baseline_workers or cores(), ppf)
+    return baseline_cell(on, name, row, own, cfg.baseline_workers or cores(), ppf)
 
 
-def record(cfg: DictConfig, objects: Sequence[str], scenes: Sequence[str]) -> dict[str, Any]:
-    """Generate the frozen scenes of these parts and write their digests into ``RECORDED``."""
+def record(cfg: DictConfig, objects: Sequence[str]) -> dict[str, Any]:
+    """Generate the frozen scenes of these parts and write their digests into ``RECORDED``; no mesh, no scenes."""
     from evaluation_job import generated_set, set_spec
     from hydra.utils import instantiate
     from whole_files import write_whole
@@ -113,8 +119,13 @@ def record(cfg: DictConfig, objects: Sequence[str], scenes: Sequence[str]) -> di
     content: Any = OmegaConf.load(RECORDED)
     frozen = dict(content.get("frozen", {}))
     for name in objects:
-        own = compose("evaluate", [f"object={name}", f"root={cfg.root}", *scenes])
-        part = instantiate(own.object)
+        own = compose("evaluate", [f"object={name}", f"root={cfg.root}", "evaluation=benchmark", *cfg.evaluate])
+        try:
+            with configuring():
+                part = instantiate(own.object)
+        except ConfigurationError as error:
+            log.warning("%s: %s", name, error)
+            continue
         frozen[name] = generated_set(own, part, set_spec(own, part)).scenes.digest
     head = "".join(line for line in RECORDED.read_text().splitlines(True) if line.startswith("#"))
     content.frozen = dict(sorted(frozen.items()))
@@ -127,8 +138,12 @@ def table_name(words: Sequence[str]) -> str:
     return next(word.partition("=")[2] for word in reversed(words) if word.startswith("table="))
 
 
-def training_words(words: Sequence[str]) -> list[str]:
+def training_words(words: Sequence[str], train: bool) -> list[str]:
     """The words that are about the trainings, not about the benchmark, the machine's preset first.
+
+    Args:
+        words: all of them.
+        train: whether trainings may be repeated: without it ``force`` is about measuring only, whoever sets it.
 
     Raises:
         ConfigurationError: when one names a single part.
@@ -137,14 +152,20 @@ def training_words(words: Sequence[str]) -> list[str]:
     names = [str(override.key_or_group) for override in parse(words)]
     if "object" in names:
         raise ConfigurationError("a benchmark takes objects=NAME,NAME, got object=: say OBJECTS=...")
-    return [word for word, name in zip(words, names, strict=True) if name.split(".")[0] not in own]
+    kept = [word for word, name in zip(words, names, strict=True) if name.split(".")[0] not in own]
+    return kept if train else [*kept, "force=false"]
 
 
 def scene_words(words: Sequence[str]) -> list[str]:
     """The words that are about the scenes; the frozen ones unless others are named."""
-    named = [str(override.key_or_group) for override in parse(words)]
-    own = [word for word, name in zip(words, named, strict=True) if name.split(".")[0] == "evaluation"]
-    return own if "evaluation" in named else ["evaluation=benchmark", *own]
+    chosen = any(str(override.key_or_group) == "evaluation" for override in parse(words))
+    return [*([] if chosen else ["evaluation=benchmark"]), *words_of("evaluation", words)]
+
+
+def words_of(group: str, words: Sequence[str]) -> list[str]:
+    """The words that choose or change a group."""
+    named = [str(override.key_or_group).split(".")[0] for override in parse(words)]
+    return [word for word, name in zip(words, named, strict=True) if name == group]
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from importlib.metadata import version as package_version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,11 +108,12 @@ def baseline_cell(
     part: Part = instantiate(cfg.object)
     settings = replace(VARIANTS[row.detector], **ppf)
     frozen = scenes_of(cfg, part)
-    key = hashlib.sha256(json.dumps([asdict(settings), frozen.digest, part.digest]).encode()).hexdigest()
+    what = [asdict(settings), frozen.digest, part.digest, package_version("opencv-contrib-python-headless")]
+    key = hashlib.sha256(json.dumps(what).encode()).hexdigest()
     place = folder / row.detector / f"{name}-{key[:12]}.json"
     known = read_json(place)
     if known is not None and not cfg.force:
-        return known
+        return known | {"frozen": is_recorded(cfg, part, frozen)}
     validation = generated_set(cfg, part, set_spec(cfg, part, "val", 1))
     log.info("%s, %s: %d scenes, and %d for its working point", row.name, name, len(frozen), len(validation))
     found = []
@@ -125,7 +127,7 @@ def baseline_cell(
         "scenes": len(frozen),
         "evaluation_set": frozen.digest,
         "frozen": is_recorded(cfg, part, frozen),
-        "sensor": cfg.evaluation.sensor.preset if cfg.evaluation.dataset is None else str(cfg.evaluation.dataset),
+        "sensor": frozen.title,
         "machine": machine(),
         "budget": None,
         "seed": cfg.simulation.seed,

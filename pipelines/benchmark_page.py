@@ -76,12 +76,18 @@ def _costs(table: BenchmarkTable, cells: Cells) -> list[str]:
                 f"{budget['steps']} steps, {budget['train_scenes']} scenes, {budget['train_seconds'] / 60:.0f} min"
             )  # fmt: skip
             same = {True: "", False: " (not the frozen one)", None: ""}[cell["frozen"]]
+            commit, p50_ms = _commit(cell["commit"]), cell["figures"]["latency_p50_ms"]
             lines.append(
                 f"| {row.name} | {name.replace('_', ' ')} | {cell['scenes']} | {low:.3f} to {high:.3f} "
-                f"| {cell['figures']['latency_p50_ms']:.0f} ms | {trained} | {cell['seed']} | `{cell['commit'][:12]}` "
+                f"| {p50_ms:.0f} ms | {trained} | {cell['seed']} | `{commit}` "
                 f"| {cell['sensor']} `{cell['evaluation_set'][:12]}`{same} | {cell['machine']} |"
             )
     return lines
+
+
+def _commit(label: str) -> str:
+    name, plus, changes = label.partition("+")
+    return name[:12] + plus + changes
 
 
 def put(page: Path, name: str, text: str) -> None:
@@ -89,10 +95,9 @@ def put(page: Path, name: str, text: str) -> None:
     begin, end = f"<!-- {name}: written by make benchmark -->", f"<!-- end of {name} -->"
     old = page.read_text(encoding="utf-8") if page.exists() else "# Benchmarks\n"
     section = f"{begin}\n{text}{end}\n"
-    if begin in old and end in old:
+    if begin in old and end in old.partition(begin)[2]:
         before, _, rest = old.partition(begin)
-        _, _, after = rest.partition(end + "\n")
-        new = before + section + after
+        new = before + section + rest.partition(end)[2].lstrip(" ").removeprefix("\n")
     else:
         new = old.rstrip("\n") + "\n\n" + section
     write_whole(page, new)

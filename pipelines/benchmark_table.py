@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 VERBS = ("train", "export", "evaluate")
@@ -66,7 +66,6 @@ class BenchmarkTable:
     measured: tuple[Row, ...]
     paper: tuple[PaperRow, ...] = ()
     curve: Curve | None = None
-    _by_method: Mapping[tuple[str, str], PaperRow] = field(default_factory=dict, repr=False, init=False)
 
     def __post_init__(self) -> None:
         for row in self.paper:

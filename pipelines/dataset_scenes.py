@@ -66,6 +66,11 @@ class DatasetScenes:
             h.update(np.round(truth.visible_fraction * 1e6).astype(np.int64).tobytes())
         return h.hexdigest()
 
+    @property
+    def title(self) -> str:
+        """Dataset and split."""
+        return f"{self.dataset.title} {self.dataset.split}"
+
     def __len__(self) -> int:
         return len(self.dataset.scored_names)
 

@@ -8,7 +8,6 @@ written into the MLflow run of the training and to outputs/evaluate. What is don
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ log = logging.getLogger("attentionvote.evaluate")
 
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Measure, record, show; the figures."""
-    from evaluation_job import EvaluationJob
+    from evaluation_job import EvaluationJob, is_recorded
     from evaluation_report import described, record, show
     from folder_lock import locked_folder
 
@@ -32,16 +31,18 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     with locked_folder(folder, cfg.outputs, "part's evaluation"):
         with configuring():
             frozen = job.evaluation_set()
-        place = folder / f"{job.bundle.digest[:12]}-{frozen.digest[:12]}-{cfg.evaluation.threads}.json"
+        name = f"{job.bundle.digest[:12]}-{frozen.digest[:12]}{job.otherwise}"
+        place = folder / f"{name}-{cfg.evaluation.threads}.json"
         result = read_json(place)
-        if result is not None and not cfg.force:
+        if result is not None and "ap_by_threshold" in result and not cfg.force:
             log.info("this evaluation is done (force=true repeats it): %s", place)
+            result |= {"frozen": is_recorded(cfg, job.part, frozen)}
         else:
             result = described(job, frozen, job.measure([job.bundle], frozen)[0])
             write_json(place, result)
         show(result)
         # Also when it is done: the store may have been away.
-        record(cfg.tracking.store, job.bundle.card.run_id, result, json.dumps(result, indent=2))
+        record(cfg.tracking.store, job.bundle.card.run_id, result, f"{name}.json", job.is_standard)
     return result
 
 

@@ -60,6 +60,18 @@ class EvaluationJob:
         """Fingerprint of the key whose signature the bundle has."""
         return fingerprint(self.key)
 
+    @property
+    def otherwise(self) -> str:
+        """What is asked of the model beside its card, for names of files."""
+        peak = self.cfg.evaluation.peak_threshold
+        return "" if peak is None else f"-peak{peak:g}"
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether the model is measured as cells run it, on the set that decides promotions."""
+        chosen = self.cfg.evaluation
+        return chosen.split == "evaluation" and chosen.dataset is None and not self.otherwise
+
     def evaluation_set(self) -> MeasuredScenes:
         """The scenes to measure on, see ``scenes_of``.
 

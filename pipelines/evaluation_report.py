@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,6 @@ def described(job: EvaluationJob, frozen: MeasuredScenes, measured: Measurement)
 
     For figures see ``figures_of``; ``frozen`` is whether the scenes are those whose digest is recorded, None without.
     """
-    chosen = job.cfg.evaluation
     return {
         "stage": "evaluate",
         "object": job.part.name,
@@ -38,10 +38,10 @@ def described(job: EvaluationJob, frozen: MeasuredScenes, measured: Measurement)
         "signed_by": job.signer,
         "evaluation_set": frozen.digest,
         "frozen": is_recorded(job.cfg, job.part, frozen),
-        "sensor": chosen.sensor.preset if chosen.dataset is None else str(chosen.dataset),
+        "sensor": frozen.title,
         "scenes": len(frozen),
         **figures_of(measured, job.part),
-        "threads": chosen.threads,
+        "threads": job.cfg.evaluation.threads,
         "machine": machine(),
     }
 
@@ -93,18 +93,27 @@ def show(result: Mapping[str, Any]) -> None:
     Console(stderr=True).print(table)
 
 
-def record(store: str | None, run_id: str, result: Mapping[str, Any], text: str) -> None:
-    """Write the figures into the training's run; a store that does not have it costs a warning, not the figures."""
+def record(store: str | None, run_id: str, result: Mapping[str, Any], name: str, figures: bool) -> None:
+    """Write the figures into the training's run; a store that does not have it costs a warning, not the figures.
+
+    Args:
+        store: of MLflow.
+        run_id: of the training.
+        result: of ``described``.
+        name: of the file that it becomes.
+        figures: whether they are the run's ``evaluation/...`` too, or of other scenes and only in the file.
+    """
     from attentionvote.tracking.finished_run import add_to_run
 
-    metrics = {f"evaluation/{name}": value for name, value in result["figures"].items()}
-    for name, (low, high) in result["intervals"].items():
-        metrics |= {f"evaluation/{name}_low": low, f"evaluation/{name}_high": high}
-    tags = {"evaluation.bundle": result["bundle"], "evaluation.set": result["evaluation_set"]}
-    name = f"evaluation/{result['bundle'][:12]}-{result['evaluation_set'][:12]}.json"
+    metrics, tags = {}, {}
+    if figures:
+        metrics = {f"evaluation/{name}": value for name, value in result["figures"].items()}
+        for figure, (low, high) in result["intervals"].items():
+            metrics |= {f"evaluation/{figure}_low": low, f"evaluation/{figure}_high": high}
+        tags = {"evaluation.bundle": result["bundle"], "evaluation.set": result["evaluation_set"]}
     try:
         if not run_id:
             raise ValueError("the model's card names no run")
-        add_to_run(store, run_id, metrics, tags, {name: text})
+        add_to_run(store, run_id, metrics, tags, {f"evaluation/{name}": json.dumps(result, indent=2)})
     except (ValueError, OSError) as error:
         log.warning("the figures are not in the training's run, the same command tries again: %s", error)

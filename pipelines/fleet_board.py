@@ -85,7 +85,7 @@ def _standing(store: str | None, name: str) -> Standing | None:
     try:
         versions = Versions(store, name)
         return stand(versions, History(versions), carry_out=False)
-    except (ValueError, OSError) as error:
+    except Exception as error:  # whatever the registry answers: what was measured is shown
         log.warning("the champion of %s is not known: %s", name, error)
         return None
 

@@ -47,6 +47,11 @@ class PromotionJob:
             ValueError: when there is no bundle, or the registry cannot be used.
         """
         evaluation = EvaluationJob.find(cfg)
+        if not evaluation.is_standard:
+            raise ValueError(
+                "a promotion must measure models as cells run them, on evaluation.split=evaluation, got another split, "
+                "dataset or peak threshold: leave them out"
+            )
         gates = cfg.gates
         floors = {name: value for name, value in gates.floors.items() if value is not None}
         margins = {name: value for name, value in gates.margins.items() if value is not None}

@@ -44,7 +44,8 @@ def main() -> int:
         print(json.dumps(outcome.result), flush=True)
         return 0
     report_failure(outcome.sentence)
-    if outcome.code < 0:
+    # Ctrl-C there is not ours: the machine was taken away.
+    if outcome.code < 0 or outcome.code == INTERRUPTED:
         os.kill(os.getpid(), signal.SIGKILL)
     return outcome.code
 

@@ -16,6 +16,8 @@ from export_job import ExportJob
 from json_files import write_json
 from training_job import find_training
 
+from attentionvote.inference import load_bundle
+
 ROOT = Path(__file__).resolve().parents[2]
 # One cycle of two scenes with a few bricks.
 FEW = ["evaluation.cycles=1", "evaluation.density=2000", "evaluate=['simulation=smoke','simulation.drop_counts=[2,3]']"]
@@ -23,11 +25,11 @@ COARSE = ["baseline_workers=1", "ppf.sampling=0.15"]
 PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "page=page.md"]
 
 
-def run(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def run(tmp_path: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The verb in a process of its own."""
     command = [sys.executable, ROOT / "pipelines" / "benchmark.py", *PLACES, *FEW, *words]
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path, env=dict(os.environ)
+        command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path, env=os.environ | environment
     )
 
 
@@ -40,7 +42,11 @@ def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any
     (trained / "model.ckpt").write_bytes(b"weights")
     facts = {"run_id": "feed" * 8, "steps": 8, "train_seconds": 60.0, "commit": "c" * 40}
     write_json(trained / "result.json", {"stage": "train", "object": "brick", **facts})
-    ExportJob.find(compose("export", ["object=brick", "scenes=32"])).finish(bundle, {})
+    (tmp_path / "outputs" / "benchmark").mkdir()
+    (tmp_path / "outputs" / "export").rename(tmp_path / "outputs" / "benchmark" / "export")
+    exported = ["object=brick", "scenes=32", "outputs=outputs/benchmark/export"]
+    bundle = load_bundle((tmp_path / "outputs" / "benchmark" / "export" / "brick" / "latest").resolve(), None)
+    ExportJob.find(compose("export", exported)).finish(bundle, {})
     smoke = ["experiment=smoke", "force=false", "export=['scenes=32']"]
     done = run(tmp_path, "table=table_5", "objects=brick", *smoke, "rows='ours,VoteNet-style,PPF'", *COARSE)
     assert done.returncode == 0, done.stderr
@@ -60,6 +66,7 @@ def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any
     assert "| paper: AttentionVote, AP at 10 % D | 0.967 | 0.992 | 0.996 | 1.000 | 0.989 |" in page
     assert f"| **ours**, AP at 10 % D | {ours['figures']['ap_10']:.3f} | not run | not run | not run |  |" in page
     assert "| VoteNet-style, AP at 2 % D | not run | not run | not run | not run |  |" in page
+    assert not (tmp_path / "outputs" / "export").exists()  # nobody's newest model
     # Another call for another object leaves these cells, and measures nothing anew.
     again = run(tmp_path, "table=table_5", "objects=pepper", *smoke, "rows=ours")
     assert again.returncode == 0, again.stderr
@@ -67,13 +74,28 @@ def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any
     assert (tmp_path / "page.md").read_text() == page
 
 
+def test_an_object_without_a_mesh_is_left_out_unless_it_is_asked_for(tmp_path: Path) -> None:
+    words = ["table=table_7", "experiment=smoke", "rows=slerp"]
+    env = {"ATTENTIONVOTE_DATA": str(tmp_path)}
+    done = run(tmp_path, *words, **env)
+    assert done.returncode == 0, done.stderr
+    assert list(json.loads(done.stdout)["left_out"]) == ["slerp, bunny", "slerp, tless_20"]
+    assert "| slerp, AP at 10 % D | not run | not run |  |" in (tmp_path / "page.md").read_text()
+    done = run(tmp_path, *words, "objects=bunny", **env)
+    assert done.returncode == 1
+    assert "benchmark: 1 cells could not be measured (first: slerp, bunny: " in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_words_of_trainings_and_of_scenes_are_told_apart() -> None:
     words = ["experiment=compact", "table=table_6", "evaluation.cycles=2", "trainer.max_epochs=12", "rows=ours"]
-    assert benchmark.training_words(words) == ["experiment=compact", "trainer.max_epochs=12"]
+    assert benchmark.training_words(words, True) == ["experiment=compact", "trainer.max_epochs=12"]
+    assert benchmark.training_words(["force=true", "seed=1"], False) == ["force=true", "seed=1", "force=false"]
     assert benchmark.scene_words(words) == ["evaluation=benchmark", "evaluation.cycles=2"]
     assert benchmark.scene_words(["evaluation=default"]) == ["evaluation=default"]
     with pytest.raises(ConfigurationError, match="a benchmark takes objects=NAME,NAME, got object="):
-        benchmark.training_words(["object=gear"])
+        benchmark.training_words(["object=gear"], False)
+    assert benchmark.words_of("object", ["object.mesh=gear.stl", "objects=gear"]) == ["object.mesh=gear.stl"]
 
 
 @pytest.mark.parametrize(
@@ -102,8 +124,10 @@ def test_the_frozen_scenes_are_recorded_by_digest(tmp_path: Path, monkeypatch: p
     recorded.write_text(f"# why\ndefaults:\n- default\nsplit: benchmark\n{known}")
     monkeypatch.setattr(benchmark, "RECORDED", recorded)
     few = ["evaluation.cycles=1", "simulation=smoke", "simulation.drop_counts=[1]", "workers=1"]
-    cfg = compose("benchmark", ["table=table_5", f"root={tmp_path}"])
-    answer = benchmark.record(cfg, ["brick"], ["evaluation=benchmark", *few])
+    told = ",".join(repr(word) for word in few)
+    cfg = compose("benchmark", ["table=table_5", f"root={tmp_path}", f"evaluate=[{told}]"])
+    monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
+    answer = benchmark.record(cfg, ["bunny", "brick"])  # the first has no mesh here
     own = compose("evaluate", ["object=brick", "evaluation=benchmark", f"root={tmp_path}", *few])
     part = instantiate(own.object)
     frozen = generated_set(own, part, set_spec(own, part))

@@ -30,7 +30,14 @@ def cell(ap: float, **changes: Any) -> dict[str, Any]:
 
 
 def test_the_papers_ours_and_what_was_not_run_stand_side_by_side() -> None:
-    text = markdown(TABLE, {("ours", "brick"): cell(0.9), ("PPF", "brick"): cell(0.3, budget=None, frozen=False)}, None)
+    text = markdown(
+        TABLE,
+        {
+            ("ours", "brick"): cell(0.9),
+            ("PPF", "brick"): cell(0.3, budget=None, frozen=False, commit="d" * 40 + "+dirty"),
+        },
+        None,
+    )
     assert text == (
         "### Table 0: a title\n\n"
         "| | brick | gear | mean |\n"
@@ -43,7 +50,7 @@ def test_the_papers_ours_and_what_was_not_run_stand_side_by_side() -> None:
         "|---|---|---|---|---|---|---|---|---|---|\n"
         "| ours | brick | 65 | 0.890 to 0.910 | 56 ms | 864 steps, 1170 scenes, 9 min | 0 | `cccccccccccc` "
         "| gaussian `abababababab` | CPU, 2 cores |\n"
-        "| PPF | brick | 65 | 0.290 to 0.310 | 56 ms | none | 0 | `cccccccccccc` "
+        "| PPF | brick | 65 | 0.290 to 0.310 | 56 ms | none | 0 | `dddddddddddd+dirty` "
         "| gaussian `abababababab` (not the frozen one) | CPU, 2 cores |\n"
     )
 
@@ -62,6 +69,8 @@ def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
     put(page, "table_0", "first\n")
     page.write_text(page.read_text() + "\nwritten by hand\n")
     put(page, "table_1", "another\n")
+    put(page, "table_0", "second\n")
+    page.write_text(page.read_text().replace("<!-- end of table_0 -->", "<!-- end of table_0 --> "))
     put(page, "table_0", "second\n")
     assert page.read_text() == (
         "# Benchmarks\n\n"

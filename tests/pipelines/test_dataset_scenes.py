@@ -62,7 +62,7 @@ def test_evaluate_measures_on_a_dataset(ipa: Path, export_brick: Any) -> None:
     bundle = export_brick("model")
     words = ["object=brick", f"evaluation.dataset={ipa}", "evaluation.density=2000"]
     result = evaluate.run(compose("evaluate", words))
-    assert (result["bundle"], result["scenes"], result["sensor"]) == (bundle.digest, 1, str(ipa))
+    assert (result["bundle"], result["scenes"], result["sensor"]) == (bundle.digest, 1, "brick test")
     assert result["frozen"] is None
     assert 0 <= result["figures"]["ap_10"] <= 1
     with pytest.raises(ConfigurationError):

@@ -52,6 +52,21 @@ def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_
     assert again["figures"]["ap_10"] == result["figures"]["ap_10"]
 
 
+def test_another_peak_threshold_is_another_evaluation_and_not_the_runs_figures(run, export_brick, put_tables, tmp_path):
+    store = put_tables(tmp_path / "mlflow.db")
+    with tracking.start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
+        pass
+    export_brick("model", training.id)
+    usual = run(f"tracking.store={store}")
+    nothing = run(f"tracking.store={store}", "evaluation.peak_threshold=1000.0")
+    assert usual["figures"]["duplicates_10"] + usual["figures"]["strays_10"] > 0
+    assert nothing["figures"]["duplicates_10"] + nothing["figures"]["strays_10"] == 0
+    assert run(f"tracking.store={store}") == usual
+    client = connect(store)
+    assert client.get_run(training.id).data.metrics["evaluation/strays_10"] == usual["figures"]["strays_10"]
+    assert len(client.list_artifacts(training.id, "evaluation")) == 2
+
+
 def test_a_run_that_is_gone_costs_a_warning_not_the_figures(run, export_brick, put_tables, tmp_path, caplog):
     export_brick("model", "feed" * 8)
     result = run(f"tracking.store={put_tables(tmp_path / 'mlflow.db')}")

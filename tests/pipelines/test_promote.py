@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -49,7 +50,7 @@ def verb(store, few_scenes, easy_gates):
     def call(name: str, *words: str):
         module = {"promote": promote, "rollback": rollback, "history": history}[name]
         settings = [*few_scenes, *easy_gates] if name == "promote" else ["object=brick"]
-        return module.run(compose(name, [*settings, f"tracking.store={store}", *words]))
+        return module.run(compose(name, [*settings, f"tracking.store='{store}'", *words]))
 
     return call
 
@@ -146,6 +147,10 @@ def test_missing_provenance_is_refused(verb, export_brick):
 
 
 def test_what_cannot_be_done_is_said_before_any_work(verb, model, tmp_path):
+    model("zero")
+    with pytest.raises(ConfigurationError, match="a promotion must measure models as cells run them"):
+        verb("promote", "evaluation.peak_threshold=0.3")
+    shutil.rmtree(tmp_path / "outputs" / "export" / "brick")
     with pytest.raises(ConfigurationError, match="must hold a bundle, got none: run `make export OBJECT=brick`"):
         verb("promote")
     with pytest.raises(ConfigurationError, match="needs an earlier champion that still exists, got none"):
@@ -178,7 +183,7 @@ def test_a_rollback_to_a_version_whose_artefacts_are_gone_moves_nothing(verb, mo
 def test_of_two_processes_that_promote_at_once_exactly_one_wins(verb, model, store, few_scenes, easy_gates, tmp_path):
     model("zero")
     verb("promote")
-    words = [*few_scenes, *easy_gates, f"tracking.store={store}"]
+    words = [*few_scenes, *easy_gates, f"tracking.store='{store}'"]
     # Both measure for seconds against the same champion: whoever comes second must lose.
     words += ["evaluation.density=40000", "simulation.drop_counts=[2,3,4,5,6,7,8,9]", "gates.scenes=1"]
     command = [sys.executable, str(ROOT / "pipelines" / "promote.py"), *words]

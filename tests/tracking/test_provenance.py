@@ -3,6 +3,8 @@
 import json
 import subprocess
 
+import pytest
+
 from attentionvote import tracking
 from attentionvote.tracking.provenance import git_state, hardware, package_versions
 
@@ -45,6 +47,24 @@ def test_a_patch_that_is_cut_is_not_whole(work_tree):
     assert len(cut.patch) < 1100
     assert "the first 1000 are kept" in cut.patch
     assert (cut.is_dirty, cut.is_whole, cut.patch_digest) == (True, False, "")
+
+
+@pytest.mark.parametrize(
+    ("setting", "name", "content", "whole"),
+    [
+        ("status.showUntrackedFiles=no", "new.txt", b"new\n", True),
+        ("color.ui=always", "a.txt", b"new\n", True),
+        ("diff.noprefix=true", "a.txt", b"new\n", True),
+        ("core.bare=false", "a.txt", "ä\n".encode("latin-1"), False),  # a text cannot hold it
+    ],
+)
+def test_the_users_settings_of_git_change_nothing(work_tree, setting, name, content, whole):
+    key, _, value = setting.partition("=")
+    subprocess.run(["git", "-C", work_tree, "config", key, value], check=True)
+    (work_tree / name).write_bytes(content)
+    state = git_state(work_tree)
+    assert (state.is_dirty, state.is_whole) == (True, whole)
+    assert f"diff --git a/{name} b/{name}\n" in state.patch
 
 
 def test_git_state_outside_of_a_repository_is_unknown(tmp_path):

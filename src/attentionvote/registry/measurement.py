@@ -41,6 +41,10 @@ class MeasuredScenes(Protocol):
     def digest(self) -> str:
         """Same digest, same clouds."""
 
+    @property
+    def title(self) -> str:
+        """What saw them, for people."""
+
     def __len__(self) -> int: ...
 
     def clouds(self) -> Iterator[Scene]:
@@ -60,6 +64,11 @@ class EvaluationSet:
     def digest(self) -> str:
         """Sha256 of everything that makes the clouds: same digest, same clouds."""
         return self.settings.key(self.scenes.digest)
+
+    @property
+    def title(self) -> str:
+        """The sensor's preset."""
+        return self.settings.sensor.preset
 
     def __len__(self) -> int:
         return len(self.scenes)

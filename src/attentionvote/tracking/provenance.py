@@ -17,6 +17,8 @@ from pathlib import Path
 PACKAGES = ("attentionvote", "torch", "lightning", "mlflow", "numpy", "scipy", "hydra-core", "mujoco-core", "trimesh")
 PATCH_LIMIT_BYTES = 1_000_000
 _PLACES = ("index", "objects")
+# As `git apply` wants it, whatever the user's own settings say.
+_PLAIN = ("--no-color", "--no-ext-diff", "--no-textconv", "--src-prefix=a/", "--dst-prefix=b/")
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,13 @@ def git_state(folder: Path, patch_limit: int = PATCH_LIMIT_BYTES) -> GitState:
     commit = (_git(folder, "rev-parse", "HEAD") or b"").decode().strip()
     if not commit:
         return GitState("unknown", "", "")
-    status = (_git(folder, "status", "--porcelain") or b"")[:100_000].decode(errors="replace")
-    if not status:
+    told = _git(folder, "status", "--porcelain", "--untracked-files=all")
+    if told == b"":
         return GitState(commit, "", "")
+    status = "unknown\n" if told is None else told[:100_000].decode(errors="replace")
     changes = _changes(folder)
-    whole = changes is not None and len(changes) <= patch_limit
-    changes = changes if changes is not None else _git(folder, "diff", "HEAD") or b""
+    whole = bool(changes) and len(changes or b"") <= patch_limit and _is_text(changes or b"")
+    changes = changes if changes is not None else _git(folder, "diff", *_PLAIN, "HEAD") or b""
     if len(changes) <= patch_limit:
         return GitState(commit, status, changes.decode(errors="replace"), whole)
     cut = f"\n[cut: {len(changes)} bytes, the first {patch_limit} are kept]\n"
@@ -98,7 +101,16 @@ def _changes(folder: Path) -> bytes | None:
             return None
         if _git(folder, "add", "--all", environment=own) is None:
             return None
-        return _git(folder, "diff", "--cached", "--full-index", "HEAD", environment=own)
+        return _git(folder, "diff", *_PLAIN, "--cached", "--full-index", "HEAD", environment=own)
+
+
+def _is_text(patch: bytes) -> bool:
+    """Whether a patch is what it was after it has been a text."""
+    try:
+        patch.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def package_versions() -> dict[str, str]:

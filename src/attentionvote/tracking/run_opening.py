@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import sys
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from attentionvote.tracking.store import connect, experiment_id, resolve_store, 
 if TYPE_CHECKING:
     from mlflow.entities import Run as MlflowRun
 
+log = logging.getLogger(__name__)
 PARENT_TAG = "mlflow.parentRunId"  # what MLflow's pages nest runs by
 SESSION_TAG = "git.session_"  # and the session's number: its commit, and the digest of its changes
 PATCH = "uncommitted.patch"
@@ -119,6 +121,11 @@ def _record_origin(run: Run, session: int, config_yaml: str, repository: Path) -
     environment = {"command": command, "hardware": hardware, "versions": versions, "git_commit": git.commit}
     run.log_text(f"{folder}environment.json", json.dumps(environment, indent=2) + "\n")
     if git.is_dirty:
+        if not git.is_whole:
+            log.warning(
+                "the changes since commit %s are not recorded whole: commit them, or no gate lets it pass",
+                git.commit[:12],
+            )
         run.log_text(f"{folder}{PATCH}", git.patch)
         run.log_text(f"{folder}uncommitted_status.txt", git.status)
     with contextlib.suppress(KeyError):
