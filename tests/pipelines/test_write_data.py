@@ -142,7 +142,7 @@ def test_the_check_refuses_what_is_wrong_and_what_is_no_dataset(
     shown = capfd.readouterr()
     assert shown.out == ""
     # brick is one of the paper's objects, but this set is not the paper's: nothing is expected.
-    assert re.search(r"ipa\s+brick\s+test\s+3\s+1\s+-\s+2\s+2\s+0\s+1", shown.err), shown.err
+    assert re.search(r"ipa\s+brick\s+test\s+3\s+1\s+-\s+2\s+7\s+0\s+1", shown.err), shown.err
     assert "scenes lack its image of labels" in caplog.text
     with pytest.raises(ConfigurationError, match=r"must hold a dataset of a known layout, got none of them .IPA:"):
         check(root)
