@@ -35,7 +35,7 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def serve(store: str | None = None, port: int = 0, timeout_s: float = 90.0) -> Iterator[Server]:
+def serve(store: str | None = None, port: int = 0, timeout_s: float = 180.0) -> Iterator[Server]:
     """Serve a store until the block ends.
 
     Args:
