@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from command import Refused, command, configuring
-from configuration import CONF, ConfigurationError, compose, parse, sentence
+from configuration import CONF, ConfigurationError, compose, parse, sentence, words_beside, words_of
 from fleet import words_of_verbs
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_hardware
@@ -97,7 +97,7 @@ def _measure(cfg: DictConfig, words: Sequence[str], row: Row, name: str) -> dict
     from hardware import cores
 
     here, own = cfg.copy(), Path(cfg.benchmarks)
-    part = words_of("object", words)
+    part = words_of(("object",), words)
     # What a benchmark exports is nobody's newest model.
     here.export = [f"outputs={own / 'export'}", *part, *cfg.export, *row.export]
     here.evaluate = [f"outputs={own / 'evaluate'}", *part, *scene_words(words), *cfg.evaluate, *row.evaluate]
@@ -148,24 +148,16 @@ def training_words(words: Sequence[str], train: bool) -> list[str]:
     Raises:
         ConfigurationError: when one names a single part.
     """
-    own = set(OmegaConf.load(CONF / "benchmark.yaml")) - {"defaults"} | {"table", "evaluation"}
-    names = [str(override.key_or_group) for override in parse(words)]
-    if "object" in names:
+    if "object" in [str(override.key_or_group) for override in parse(words)]:
         raise ConfigurationError("a benchmark takes objects=NAME,NAME, got object=: say OBJECTS=...")
-    kept = [word for word, name in zip(words, names, strict=True) if name.split(".")[0] not in own]
+    kept = words_beside("benchmark", ("table", "evaluation"), words)
     return kept if train else [*kept, "force=false"]
 
 
 def scene_words(words: Sequence[str]) -> list[str]:
     """The words that are about the scenes; the frozen ones unless others are named."""
     chosen = any(str(override.key_or_group) == "evaluation" for override in parse(words))
-    return [*([] if chosen else ["evaluation=benchmark"]), *words_of("evaluation", words)]
-
-
-def words_of(group: str, words: Sequence[str]) -> list[str]:
-    """The words that choose or change a group."""
-    named = [str(override.key_or_group).split(".")[0] for override in parse(words)]
-    return [word for word, name in zip(words, named, strict=True) if name == group]
+    return [*([] if chosen else ["evaluation=benchmark"]), *words_of(("evaluation",), words)]
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ with the nearest valid name, before any work starts:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,22 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         except (OverrideParseException, HydraException) as error:
             raise ConfigurationError(f"every argument must be key=value, got {word!r}") from error
     return parsed
+
+
+def words_of(sections: Collection[str], words: Sequence[str]) -> list[str]:
+    """The words that choose or change one of these sections (what a setting's name has before its first dot)."""
+    return [word for word, section in _sections(words) if section in sections]
+
+
+def words_beside(verb: str, more: Collection[str], words: Sequence[str]) -> list[str]:
+    """The words that a verb hands on: neither of settings that its own file makes, nor of the sections ``more``."""
+    own = set(OmegaConf.load(CONF / f"{verb}.yaml")) - {"defaults"} | set(more)
+    return [word for word, section in _sections(words) if section not in own]
+
+
+def _sections(words: Sequence[str]) -> list[tuple[str, str]]:
+    """Every word with its section."""
+    return [(word, str(o.key_or_group).split(".")[0]) for word, o in zip(words, parse(words), strict=True)]
 
 
 def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfig:

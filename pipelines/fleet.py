@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from command import Refused, command, configuring
-from configuration import CONF, ConfigurationError, choices, compose, nearest, parse, sentence
-from omegaconf import DictConfig, OmegaConf
+from configuration import ConfigurationError, choices, compose, nearest, parse, sentence, words_beside
+from omegaconf import DictConfig
 from several_parts import only_part
 from train import preset_of_workers
 
@@ -87,11 +87,9 @@ def training_words(words: Sequence[str]) -> list[str]:
     Raises:
         ConfigurationError: when one names a single part.
     """
-    own = set(OmegaConf.load(CONF / "fleet.yaml")) - {"defaults"} | {"workers", "executor", "cluster"}
-    names = [str(override.key_or_group) for override in parse(words)]
-    if "object" in names:
+    if "object" in [str(override.key_or_group) for override in parse(words)]:
         raise ConfigurationError("a fleet takes objects=NAME,NAME or objects=all, got object=: say OBJECTS=...")
-    return [word for word, name in zip(words, names, strict=True) if name.split(".")[0] not in own]
+    return words_beside("fleet", ("workers", "executor", "cluster"), words)
 
 
 def members(objects: str, training: Sequence[str]) -> tuple[dict[str, TrainingJob], dict[str, str]]:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from command import command, configuring
-from configuration import CONF, choices, compose, parse, primary_groups
+from configuration import choices, compose, primary_groups, words_beside, words_of
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_workers
 
@@ -42,19 +42,13 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
 
 def training_words(words: Sequence[str]) -> list[str]:
     """The words that are about the trainings, not about the sweep."""
-    own = set(OmegaConf.load(CONF / "sweep.yaml")) - {"defaults"} | {"sweep", "workers", "force", "resume", *_PLACE}
-    return [word for word, name in zip(words, _sections(words), strict=True) if name not in own]
+    return words_beside("sweep", ("sweep", "workers", "force", "resume", *_PLACE), words)
 
 
 def preset_of_trials(words: Sequence[str]) -> list[str]:
     """The preset of the machines that train, told by the words that say which these are."""
-    place = [word for word, name in zip(words, _sections(words), strict=True) if name in _PLACE]
+    place = words_of(_PLACE, words)
     return preset_of_workers(compose("sweep", [f"object={choices('object')[0]}", *place]), words)
-
-
-def _sections(words: Sequence[str]) -> list[str]:
-    """What each word is about, without the part after the first dot."""
-    return [str(override.key_or_group).split(".")[0] for override in parse(words)]
 
 
 def _space_name(words: Sequence[str]) -> str:

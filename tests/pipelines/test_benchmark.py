@@ -95,7 +95,7 @@ def test_words_of_trainings_and_of_scenes_are_told_apart() -> None:
     assert benchmark.scene_words(["evaluation=default"]) == ["evaluation=default"]
     with pytest.raises(ConfigurationError, match="a benchmark takes objects=NAME,NAME, got object="):
         benchmark.training_words(["object=gear"], False)
-    assert benchmark.words_of("object", ["object.mesh=gear.stl", "objects=gear"]) == ["object.mesh=gear.stl"]
+    assert benchmark.words_of(("object",), ["object.mesh=gear.stl", "objects=gear"]) == ["object.mesh=gear.stl"]
 
 
 @pytest.mark.parametrize(
