@@ -1,6 +1,7 @@
 """Git state of real repositories, whole and cut patches, versions."""
 
 import json
+import os
 import subprocess
 
 import pytest
@@ -65,6 +66,20 @@ def test_the_users_settings_of_git_change_nothing(work_tree, setting, name, cont
     state = git_state(work_tree)
     assert (state.is_dirty, state.is_whole) == (True, whole)
     assert f"diff --git a/{name} b/{name}\n" in state.patch
+
+
+def test_a_change_within_the_second_of_the_commit_is_kept(work_tree):
+    """Same size, same time as in the index: git compares the content only when the index is not younger than the file."""
+    file, index, second = work_tree / "a.txt", work_tree / ".git" / "index", (1_790_000_000, 1_790_000_000)
+    os.utime(file, second)
+    for words in (["config", "core.trustctime", "false"], ["update-index", "--refresh"]):
+        subprocess.run(["git", "-C", work_tree, *words], check=True)
+    os.utime(index, second)
+    file.write_text("new\n")
+    os.utime(file, second)
+    state = git_state(work_tree)
+    assert (state.is_dirty, state.is_whole) == (True, True)
+    assert "+new" in state.patch
 
 
 def test_git_state_outside_of_a_repository_is_unknown(tmp_path):

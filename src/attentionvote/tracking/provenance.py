@@ -96,7 +96,8 @@ def _changes(folder: Path) -> bytes | None:
         own["GIT_ALTERNATE_OBJECT_DIRECTORIES"] = str((folder / objects).resolve())
         try:
             Path(own["GIT_OBJECT_DIRECTORY"]).mkdir()
-            shutil.copyfile(folder / index, own["GIT_INDEX_FILE"])
+            # With its time: by it git knows which files may have changed within the second it was written in.
+            shutil.copy2(folder / index, own["GIT_INDEX_FILE"])
         except OSError:
             return None
         if _git(folder, "add", "--all", environment=own) is None:
