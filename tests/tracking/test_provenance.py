@@ -69,7 +69,7 @@ def test_the_users_settings_of_git_change_nothing(work_tree, setting, name, cont
 
 
 def test_a_change_within_the_second_of_the_commit_is_kept(work_tree):
-    """Same size, same time as in the index: git compares the content only when the index is not younger than the file."""
+    """Same size, same time as in the index: git compares the content only when the index is as old as the file."""
     file, index, second = work_tree / "a.txt", work_tree / ".git" / "index", (1_790_000_000, 1_790_000_000)
     os.utime(file, second)
     for words in (["config", "core.trustctime", "false"], ["update-index", "--refresh"]):
