@@ -35,53 +35,51 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         cfg: the benchmark's configuration.
         words: it was composed of; those of the training are handed on.
     """
-    from benchmark_cells import CellFailed
+    from benchmark_cells import CellFailed, cells_of_parts
     from benchmark_page import draw, markdown, put
+    from benchmark_record import BenchmarkRecord
     from benchmark_table import BenchmarkTable
     from folder_lock import locked_folder
-    from json_files import read_json, write_json
 
     plain: Any = OmegaConf.to_container(cfg.table, resolve=True)
     with configuring():
         table = BenchmarkTable.of(table_name(words), plain)
         objects, rows = table.chosen(cfg.objects, cfg.rows)
     if cfg.record:
-        return record(cfg, objects)
+        return record(cfg, [*objects, *(row.together for row in rows if row.together)])
     folder = Path(cfg.benchmarks)
     with locked_folder(folder, cfg.benchmarks, "benchmark", "benchmarks"):
-        place = folder / f"{table.name}.json"
-        # Without a page nothing of earlier calls is shown, and nothing of this one is kept for later ones.
-        stored = (read_json(place) or {}) if cfg.page else {}
-        cells = {(cell["row"], cell["object"]): cell for cell in stored.get("cells", [])}
+        with configuring():
+            kept = BenchmarkRecord.beside(cfg.page, table.name)
         failures: dict[str, str] = {}
         left_out: dict[str, str] = {}
         for row in rows:
-            for name in objects:
+            for name in objects if row.together is None else (row.together,):
                 try:
                     with configuring():
                         cell = _measure(cfg, words, row, name)
+                    shown = {name: cell} if row.together is None else cells_of_parts(cell, objects)
                 except (CellFailed, ConfigurationError) as error:
                     # A part without a mesh, say, is no failure where nobody asked for it by name.
                     unasked = isinstance(error, ConfigurationError) and cfg.objects is None
                     (left_out if unasked else failures)[f"{row.name}, {name}"] = sentence(error)
                     log.warning("%s, %s: %s", row.name, name, sentence(error))
                     continue
+                for part, measured in shown.items():
+                    if measured is not None:
+                        kept.add(row.name, part, measured)
                 if cell is None:
                     log.info("%s, %s: not run (train=true trains it)", row.name, name)
-                    continue
-                cells[row.name, name] = {"row": row.name, "object": name, **cell}
-                if cfg.page:
-                    write_json(place, {"table": table.name, "cells": list(cells.values())})
         if cfg.page:
             page = Path(cfg.page)
             picture = f"{IMAGES}/{table.name}.png"
-            drawn = table.curve is not None and draw(table, table.curve, cells, page.parent / picture)
-            put(page, table.name, markdown(table, cells, picture if drawn else None))
+            drawn = table.curve is not None and draw(table, table.curve, kept.cells, page.parent / picture)
+            put(page, table.name, markdown(table, kept.cells, picture if drawn else None))
             log.info("%s: written into %s", table.title, page)
     result = {
         "stage": "benchmark",
         "table": table.name,
-        "cells": [cells[key] for key in cells],
+        "cells": list(kept.cells.values()),
         "failures": failures,
         "left_out": left_out,
         "page": cfg.page,

@@ -77,6 +77,28 @@ def network_cell(
     }
 
 
+def cells_of_parts(cell: Mapping[str, Any] | None, parts: Sequence[str]) -> dict[str, dict[str, Any] | None]:
+    """What a cell of several parts in one bin says of each of these; the time of a scene is that of all.
+
+    Raises:
+        CellFailed: when one is not in the bin.
+    """
+    return {part: None if cell is None else _cell_of_part(cell, part) for part in parts}
+
+
+def _cell_of_part(cell: Mapping[str, Any], part: str) -> dict[str, Any]:
+    begin = f"{part}/"
+    own = {
+        kind: {name.removeprefix(begin): value for name, value in cell[kind].items() if name.startswith(begin)}
+        for kind in ("figures", "intervals")
+    }
+    if not own["figures"]:
+        raise CellFailed(f"the bin must hold the part {part}, got none")
+    times = {name: value for name, value in cell["figures"].items() if name.startswith("latency_")}
+    shared = {key: value for key, value in cell.items() if key not in ("thresholds", "ap_by_threshold")}
+    return shared | own | {"figures": own["figures"] | times}
+
+
 def baseline_cell(
     evaluate: Sequence[str], name: str, row: Row, folder: Path, workers: int, ppf: Mapping[str, Any]
 ) -> dict[str, Any]:

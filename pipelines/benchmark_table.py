@@ -20,6 +20,8 @@ class Row:
         detector: ``network``, ``ppf`` (point pair features), ``ppf_icp`` (with its registration) or ``ppf_icp_fit``
             (and ranked by how well the pose fits).
         train, export, evaluate: further words of the verbs.
+        together: set of parts that is measured in place of each object by itself: one network, all parts in one bin.
+            The figures of its parts are the row's.
     """
 
     name: str
@@ -27,8 +29,13 @@ class Row:
     train: tuple[str, ...] = ()
     export: tuple[str, ...] = ()
     evaluate: tuple[str, ...] = ()
+    together: str | None = None
 
     def __post_init__(self) -> None:
+        if "," in self.name:
+            raise ValueError(f"a row's name must have no comma, rows= is a list of them; got {self.name!r}")
+        if self.together is not None and self.detector != "network":
+            raise ValueError(f"detector must be network for a row of parts together, got {self.detector!r}")
         if self.detector not in DETECTORS:
             raise ValueError(f"detector must be one of {', '.join(DETECTORS)}, got {self.detector!r}")
 
@@ -81,10 +88,7 @@ class BenchmarkTable:
     @classmethod
     def of(cls, name: str, content: Mapping[str, Any]) -> BenchmarkTable:
         """The table of a file's plain content."""
-        rows = [
-            Row(row["name"], row.get("detector", "network"), *(tuple(row.get(verb, ())) for verb in VERBS))
-            for row in content["measured"]
-        ]
+        rows = [Row(**{**row, **{verb: tuple(row.get(verb, ())) for verb in VERBS}}) for row in content["measured"]]
         paper = [PaperRow(row["method"], row["figure"], tuple(row["values"])) for row in content["paper"]]
         curve = Curve(**content["curve"]) if content["curve"] else None
         figures, objects = tuple(content["figures"]), tuple(content["objects"])

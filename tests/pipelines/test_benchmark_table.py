@@ -37,7 +37,8 @@ def test_every_row_composes_with_the_verbs_it_means(name: str) -> None:
     table = BenchmarkTable.of(name, content(name))
     assert set(table.objects) <= set(choices("object"))
     for row in table.measured:
-        train = compose("train", ["object=brick", *row.train])
+        train = compose("train", [f"object={row.together or 'brick'}", *row.train])
+        assert set(table.objects) <= set(train.object.get("parts", table.objects))
         assert OmegaConf.to_container(train, resolve=True)
         compose("export", ["object=brick", *row.export])
         compose("evaluate", ["object=brick", "evaluation=benchmark", *row.evaluate])
@@ -85,6 +86,10 @@ def test_a_row_with_a_value_too_many_is_refused(small: dict[str, Any]) -> None:
 def test_an_unknown_detector_and_a_name_twice_are_refused(small: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="detector must be one of network, ppf, ppf_icp, ppf_icp_fit, got 'icp'"):
         BenchmarkTable.of("T", {**small, "measured": [{"name": "PPF", "detector": "icp"}]})
+    with pytest.raises(ValueError, match="a row's name must have no comma, rows= is a list of them; got 'a, b'"):
+        BenchmarkTable.of("T", {**small, "measured": [{"name": "a, b"}]})
+    with pytest.raises(ValueError, match="detector must be network for a row of parts together, got 'ppf'"):
+        BenchmarkTable.of("T", {**small, "measured": [{"name": "PPF", "detector": "ppf", "together": "industrial"}]})
     with pytest.raises(ValueError, match="every row must have a name of its own, got ours, ours"):
         BenchmarkTable.of("T", {**small, "measured": [{"name": "ours"}, {"name": "ours"}]})
 
