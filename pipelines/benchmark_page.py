@@ -90,9 +90,16 @@ def _commit(label: str) -> str:
     return name[:12] + plus + changes
 
 
-def put(page: Path, name: str, text: str) -> None:
-    """Write a table's section between its marks, or at the end of the page; whole or not at all."""
-    begin, end = f"<!-- {name}: written by make benchmark -->", f"<!-- end of {name} -->"
+def put(page: Path, name: str, text: str, writer: str = "make benchmark") -> None:
+    """Write a section between its marks, or at the end of the page; whole or not at all.
+
+    Args:
+        page: other sections of it, and what is written by hand, stay.
+        name: of the section.
+        text: of whole lines.
+        writer: the command that writes it, for its mark.
+    """
+    begin, end = f"<!-- {name}: written by {writer} -->", f"<!-- end of {name} -->"
     old = page.read_text(encoding="utf-8") if page.exists() else "# Benchmarks\n"
     section = f"{begin}\n{text}{end}\n"
     if begin in old and end in old.partition(begin)[2]:
