@@ -103,7 +103,7 @@ def test_words_of_trainings_and_of_scenes_are_told_apart() -> None:
     [
         (
             ["rows=theirs"],
-            "benchmark: rows must be among those of table_6, ours, ours (one network), VoteNet-style, PPF, PPF and ICP; ",
+            "benchmark: rows must be among those of table_6, ours, ours (one network), VoteNet-style, PPF, PPF and ICP",
         ),
         (["objects=gear"], "benchmark: objects must be among those of table_6, vertical_bearing_pedestal, "),
         (["trainer.max_epoch=3"], "benchmark: there is no setting 'trainer.max_epoch', did you mean"),
