@@ -42,6 +42,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     from executors import cores_of_a_job, executor_of
     from fleet_member import MemberTask
     from folder_lock import locked_folder
+    from job_process import handed_on
 
     training = [*preset_of_workers(cfg, words), *training_words(words)]
     with configuring():
@@ -56,7 +57,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     own = () if here else (f"workers={threads}", f"trainer.threads={threads}")
     # The user's words come last: a number of threads that was asked for is kept.
     member_words, places = words_of_verbs(cfg, (*own, *training), next(iter(jobs)))
-    task = MemberTask(member_words, None if here else folder / "logs")
+    task = MemberTask(member_words, None if here else folder / "logs", environment=handed_on())
     with locked_folder(folder, cfg.fleets, "fleet", "fleets"):
         answers = _run(task, list(jobs), executor, workers, cfg.retries, threads)
         rows = [

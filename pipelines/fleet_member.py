@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ class MemberTask:
         words: of every verb.
         logs: folder for what the verbs say; None shows it here.
         scripts: folder of the verbs.
+        environment: further variables of their processes.
     """
 
     words: dict[str, tuple[str, ...]]
     logs: Path | None
     scripts: Path = SCRIPTS
+    environment: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def __call__(self, name: str) -> dict[str, Any]:
         """What the verbs answered, by verb; ``failed`` names the verb that did not, ``sentence`` says why."""
@@ -46,7 +49,7 @@ class MemberTask:
     def _run(self, verb: str, words: list[str], name: str) -> Any:
         script = self.scripts / f"{verb}.py"
         if self.logs is None:
-            return JobProcess(script, words).wait()
+            return JobProcess(script, words, environment=self.environment).wait()
         self.logs.mkdir(parents=True, exist_ok=True)
         with (self.logs / f"{name}-{verb}.log").open("ab") as log:
-            return JobProcess(script, words, stderr=log).wait()
+            return JobProcess(script, words, log, self.environment).wait()

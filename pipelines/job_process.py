@@ -23,8 +23,15 @@ from typing import IO, Any
 
 PARENT, FAILURE = "ATTENTIONVOTE_JOB_PARENT", "ATTENTIONVOTE_JOB_FAILURE"
 INTERRUPTED = 130
+# What a job reads of its environment, the passwords of study and tracking included.
+_HANDED_ON = ("ATTENTIONVOTE_", "MLFLOW_TRACKING_", "PG")
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _GRACE_S = 90.0  # for a job to end orderly after Ctrl-C
+
+
+def handed_on() -> dict[str, str]:
+    """Variables for a job that does not start from here: a worker of Ray has the environment of `ray start`."""
+    return {name: value for name, value in os.environ.items() if name.startswith(_HANDED_ON)}
 
 
 @dataclass(frozen=True)

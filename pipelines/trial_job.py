@@ -16,15 +16,11 @@ from typing import Any
 
 from configuration import sentence
 from folder_lock import locked_folder
-from job_process import INTERRUPTED, Outcome, join_starter, report_failure
+from job_process import INTERRUPTED, Outcome, handed_on, join_starter, report_failure
 from trial_place import VARIABLE, WORKER
 from trial_task import TrialTask
 
 from attentionvote.execution import WorkerDied, executor_named, run_all
-
-# What a training reads of its environment beside its trial, the passwords of study and tracking included: a worker of
-# Ray has the environment of `ray start`.
-_HANDED_ON = ("ATTENTIONVOTE_", "MLFLOW_TRACKING_", "PG")
 
 
 def main() -> int:
@@ -52,9 +48,8 @@ def main() -> int:
 
 def _run(about: dict[str, Any], number: int, words: tuple[str, ...]) -> Outcome:
     executor = executor_named(about["executor"], about["cluster"])
-    environment = {name: value for name, value in os.environ.items() if name.startswith(_HANDED_ON)}
     log = Path(about["log"]).absolute()
-    task = TrialTask(Path(about["script"]), words, environment, log, log.with_suffix(""))
+    task = TrialTask(Path(about["script"]), words, handed_on(), log, log.with_suffix(""))
     with locked_folder(task.claim, str(task.claim), "trial", "sweeps"):
         ((_, outcome),) = run_all(task, [number], executor, retries=0, threads=about["threads"])
     return outcome
