@@ -10,6 +10,7 @@ STAMP := $(VENV)/.setup-complete
 OBJECT ?=
 OBJECTS ?=
 TABLE ?=
+ROWS ?=
 NAME ?=
 MESH ?=
 UNITS ?=
@@ -36,7 +37,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback history score serve keys bench-serve image generate view check-data write-data part ui test test-fast lint format clean
+.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback history score serve keys bench bench-serve image generate view check-data write-data part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -113,6 +114,9 @@ serve: $(STAMP) ## Serve the newest bundle on this machine, as a cell does: OBJE
 
 keys: $(STAMP) ## Make the pair of keys that signs bundles (export does it when there is none)
 	@$(VENV)/bin/attentionvote keys $(ARGS)
+
+bench: $(STAMP) ## Every fast path beside its reference, in one run: [ROWS=ball-query,normals ARGS="rounds=7"]
+	@$(PY) pipelines/bench.py $(if $(ROWS),"rows='$(ROWS)'") $(ARGS)
 
 bench-serve: $(STAMP) ## Load the server with 4 clients for a minute: OBJECT=connecting_rod [ARGS="--seconds 60"]
 	@$(PY) pipelines/bench_serve.py $(bundle) $(ARGS)

@@ -76,6 +76,8 @@ RANGES: tuple[Range, ...] = (
     Range("format", options=("ipa", "bop")),
     Range("objects", kind=str),
     Range("rows", kind=str),
+    Range("rounds", low=1, high=1000),
+    Range("batch.*", low=1, high=1024),
     Range("table.curve", kind=dict),
     Range("ppf.sampling", low=0.02, high=0.2),
     Range("ppf.reference_step", low=1, high=100),

@@ -1,0 +1,75 @@
+"""Rows of ``make bench`` about the exported graph: beside torch, and inside the cell's estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from bench_data import slowly
+from bench_material import Material
+from bench_row import Contest, Unequal
+from bench_rows import EAGER, GRAPH
+from numpy.typing import NDArray
+
+from attentionvote.inference import PoseEstimator
+from attentionvote.inference.bundle import Bundle
+from attentionvote.inference.preparation import prepare
+from attentionvote.inference.runtime import Session
+from attentionvote.model import Predictions
+
+KERNELS = "torch with C kernels"
+MOST_MM = 0.01
+LEAST_SHARE = 0.95  # of proposals: one on the edge of a box or a ball may change sides, as make export reports
+
+
+def graph(material: Material, size: str) -> Contest:
+    """Neighbours found in the graph; plain torch is given them, torch with C kernels finds them."""
+    model, batch = material.network(size), material.batch(size, 1)
+    session = Session(material.graph(size), material.card(size))
+    points, normals = batch.points.numpy(), batch.normals.numpy()
+
+    def eager(found: bool) -> Callable[[], Predictions]:
+        def run() -> Predictions:
+            with torch.no_grad():
+                answer: Predictions = model(batch.points, batch.normals, batch.found if found else None)
+            return answer
+
+        return run
+
+    def compare(fast: dict[str, NDArray], others: Mapping[str, Predictions]) -> str:
+        texts = []
+        for name, other in others.items():
+            apart_mm = 1e3 * np.linalg.norm(fast["center"] - other.center.numpy(), axis=-1)
+            share = float((apart_mm <= MOST_MM).mean())
+            if share < LEAST_SHARE:
+                wanted = f"{LEAST_SHARE:.0%} of the proposals must lie within {MOST_MM} mm"
+                raise Unequal(f"{wanted} of those of {name}, got {share:.0%}")
+            texts.append(share)
+        return f"{min(texts):.0%} of the proposals within {MOST_MM} mm"
+
+    text = f"{points.shape[1]:,} points"
+    references = {EAGER: slowly(eager(True)), KERNELS: eager(False)}
+    return Contest(lambda: session.run(points, normals), references, compare, text)
+
+
+def cell(material: Material, size: str) -> Contest:
+    """The shipped estimator on a cloud as dense as its card allows, beside the graph on what it prepared."""
+    card, model = material.card(size), material.graph(size)
+    estimator = PoseEstimator(Bundle(material.folder, card, "0" * 64, model))
+    session, cloud = Session(model, card), material.sensed(card.density)
+    prepared = prepare(cloud, card)
+
+    def compare(fast: Any, others: Mapping[str, dict[str, NDArray]]) -> str:
+        outputs = others[GRAPH]
+        answered = outputs["center"][0][(outputs["confidence"][0] > 0) & (outputs["peak_heat"][0] > 0)]
+        found = np.array([one.camera_from_part[:3, 3] for one in fast.detections])
+        apart = np.abs(found[:, None] - answered[None]).sum(-1).min(1) if len(answered) else np.full(len(found), np.inf)
+        if not len(found) or apart.max() > 1e-6:
+            raise Unequal(f"the cell's {len(found)} poses must be the graph's {len(answered)}, but they are others")
+        return f"{len(found)} poses are the graph's"
+
+    text = f"{len(cloud):,} points sent, {card.points:,} in the graph"
+    references = {GRAPH: lambda: session.run(prepared.points, prepared.normals)}
+    return Contest(lambda: estimator.estimate(cloud), references, compare, text)

@@ -1,0 +1,136 @@
+"""Rows of ``make bench`` about points: farthest-point order, ball queries, normals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from bench_material import Material
+from bench_row import Contest, Unequal
+from bench_rows import CDIST, OPEN3D, QUICKFPS
+from numpy.typing import NDArray
+
+from attentionvote.geometry import sampling, sampling_reference
+from attentionvote.geometry.pointcloud import estimate_normals
+
+MOST_DEGREES = 0.01  # between normals of two estimators
+
+
+def identical(fast: Any, others: Mapping[str, Any]) -> str:
+    """Results are nested lists or tuples of arrays, all equal to the last bit.
+
+    Raises:
+        Unequal: when one is not.
+    """
+    for name, other in others.items():
+        for a, b in zip(_arrays(fast), _arrays(other), strict=True):
+            if not np.array_equal(a, b):
+                share = float(np.mean(np.asarray(a) != np.asarray(b))) if np.shape(a) == np.shape(b) else 1.0
+                raise Unequal(f"results must be identical to those of {name}, but {share:.2%} of the numbers differ")
+    return "identical"
+
+
+def _arrays(result: Any) -> list[Any]:
+    if isinstance(result, (list, tuple)):
+        return [array for item in result for array in _arrays(item)]
+    return [result]
+
+
+def farthest_points(material: Material) -> Contest:
+    """The C operator beside numpy and, where it is installed, torch-quickfps."""
+    model = material.trainings["full"]
+    count = model.model.centers[0]
+    cloud = material.sensed(model.data.points)
+    references: dict[str, Callable[[], Any]] = {"numpy": lambda: sampling_reference.farthest_point_order(cloud, count)}
+    absent: tuple[str, ...] = ()
+    try:
+        import torch
+        import torch_quickfps  # type: ignore[import-not-found]
+    except ImportError:
+        absent = (QUICKFPS,)
+    else:
+        tensor = torch.from_numpy(cloud)
+        references[QUICKFPS] = lambda: torch_quickfps.sample_idx(tensor, count, h=5, start_idx=0).numpy()
+
+    def compare(fast: NDArray, others: Mapping[str, NDArray]) -> str:
+        if not np.array_equal(sampling.farthest_point_order(cloud, count // 2), fast[: count // 2]):
+            raise Unequal("half as many farthest points must be the first half of all, but they are others")
+        return f"{identical(fast, others)}, prefixes too"
+
+    size = f"{len(cloud):,} to {count:,} points"
+    return Contest(lambda: sampling.farthest_point_order(cloud, count), references, compare, size, absent=absent)
+
+
+def ball_queries(material: Material) -> Contest:
+    """The C operator beside distances of all pairs in torch, of which the first k inside are kept."""
+    import torch
+
+    layout = material.network("full").layout
+    cloud = material.sensed(material.trainings["full"].data.points)
+    ordered = cloud[sampling.farthest_point_order(cloud, layout.centers[0])]
+    below = [cloud, *(ordered[:size] for size in layout.centers)]
+    levels = list(zip(below, layout.centers, layout.radii, layout.neighbors, strict=False))
+
+    def fast() -> list[NDArray]:
+        return [sampling.ball_query(p, ordered[:size], r, k)[0] for p, size, r, k in levels]
+
+    def numpy() -> list[NDArray]:
+        return [sampling_reference.ball_query(p, ordered[:size], r, k)[0] for p, size, r, k in levels]
+
+    def cdist() -> list[NDArray]:
+        found = []
+        for points, size, radius, k in levels:
+            p, c = torch.from_numpy(points), torch.from_numpy(ordered[:size])
+            # By differences: the matrix product's rounding would move points across the edge.
+            inside = torch.cdist(c, p, compute_mode="donot_use_mm_for_euclid_dist") <= radius
+            index = torch.arange(len(p), dtype=torch.int32).expand(size, -1).masked_fill(~inside, len(p))
+            index = torch.topk(index, k, largest=False, sorted=True)[0]
+            found.append(torch.where(index == len(p), index[:, :1], index).long().numpy())
+        return found
+
+    size = f"{len(cloud):,} points, {' / '.join(f'{c:,} x {k}' for _, c, _, k in levels)}"
+    return Contest(fast, {CDIST: cdist, "numpy": numpy}, identical, size)
+
+
+def normals(material: Material) -> Contest:
+    """The product's estimator beside a plain one with scipy and, where it is installed, Open3D."""
+    from scipy.spatial import cKDTree
+
+    data = material.trainings["full"].data
+    cloud, neighbors = material.sensed(data.points), data.normal_neighbors
+
+    def scipy() -> NDArray:
+        near = cloud.astype(np.float64)[cKDTree(cloud).query(cloud, k=neighbors)[1]]
+        centred = near - near.mean(axis=1, keepdims=True)
+        return np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1][:, :, 0]
+
+    references: dict[str, Callable[[], Any]] = {"scipy's tree and eigh": scipy}
+    absent: tuple[str, ...] = ()
+    try:
+        import open3d  # type: ignore[import-not-found]
+    except (ImportError, OSError):
+        absent = (OPEN3D,)
+    else:
+
+        def with_open3d() -> NDArray:
+            made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud))
+            made.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(neighbors))
+            made.orient_normals_towards_camera_location()
+            return np.asarray(made.normals)
+
+        references[OPEN3D] = with_open3d
+
+    def compare(fast: NDArray, others: Mapping[str, NDArray]) -> str:
+        worst = 0.0
+        for name, other in others.items():
+            sine = np.linalg.norm(np.cross(fast, other), axis=1)
+            angle = np.degrees(np.arcsin(np.clip(sine, 0, 1)))
+            worst = max(worst, float(angle.max()))
+            if worst > MOST_DEGREES:
+                raise Unequal(f"normals must lie within {MOST_DEGREES} degrees of those of {name}, got {worst:.3f}")
+        return f"within {worst:.4f} degrees"
+
+    return Contest(
+        lambda: estimate_normals(cloud, None, neighbors), references, compare, f"{len(cloud):,} points", absent=absent
+    )
