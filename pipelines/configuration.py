@@ -137,7 +137,7 @@ def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfi
     for override in values:
         key = override.key_or_group
         if not (override.is_add() or override.is_delete()):
-            check_types(key, _select(base, key), _select(final, key))
+            check_types(key, _select(base, key), _kept(final, override))
     for key, value in leaves(final):
         problem = violation(key, value)
         if problem:
@@ -218,6 +218,17 @@ def _select(plain: Any, key: str) -> Any:
         else:
             raise KeyError(key)
     return node
+
+
+def _kept(final: dict[str, Any], override: Override) -> Any:
+    """The value that an override has in the end."""
+    try:
+        return _select(final, override.key_or_group)
+    except KeyError:
+        raise ConfigurationError(
+            f"{override.input_line} must stay in the configuration, but another word takes its section away: leave one "
+            "of them out"
+        ) from None
 
 
 def check_types(key: str, default: Any, value: Any) -> None:

@@ -21,8 +21,8 @@ from hypothesis import settings  # noqa: E402
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
-# Fixtures that several folders of tests share.
-pytest_plugins = ["bop_split", "box_scenes", "brick_models", "databases", "tiny_bundle", "work_trees"]
+# Fixtures that several folders of tests share, and how the tests are distributed.
+pytest_plugins = ["bop_split", "box_scenes", "brick_models", "databases", "quick_training", "tiny_bundle", "work_trees"]
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT / ".." / "shared" / "data"
 

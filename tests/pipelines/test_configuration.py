@@ -63,6 +63,10 @@ def test_an_experiment_is_stronger_than_the_primary_file_and_weaker_than_the_wor
         ("object=gear lr=abc", "there is no setting 'lr', did you mean 'trainer.lr'?"),
         ("object=gear max_epoch=1", "there is no setting 'max_epoch', did you mean 'trainer.max_epochs'?"),
         ("object=gear nothing_like_it=1", "there is no setting 'nothing_like_it'"),
+        (
+            "object=gear trainer.lr=0.1 ~trainer.lr",
+            "trainer.lr=0.1 must stay in the configuration, but another word takes its section away: leave one of them out",
+        ),
         ("object=gear trainer.lr=abc", "trainer.lr must be a finite number such as 0.001; got 'abc'"),
         ("object=gear trainer.lr=null", "trainer.lr must be a finite number such as 0.001; got null"),
         ("object=gear trainer.lr=true", "trainer.lr must be a finite number such as 0.001; got True"),

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import inspect
 import json
-import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import train
 from configuration import ConfigurationError, compose
-from scipy.spatial import ConvexHull
 from training_job import find_training
 
-from attentionvote.part import Part
-from attentionvote.simulation import scene_set
-from attentionvote.tracking import figures, scene_pictures
 from attentionvote.training.checkpoint import load_trained
 
 # The set without its third part: the rod and the slider bearing pedestal.
@@ -36,22 +28,7 @@ TWO = [
     "model.voxel_fraction=0.1", "trainer.train_heat=0.0", "trainer.peak_threshold=0.01",
 ]  # fmt: skip
 NAMES = ["connecting_rod", "slider_bearing_pedestal"]
-
-
-@pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def one_hull(part: Part, *_: object) -> tuple:
-        return (part.vertices[ConvexHull(part.vertices).vertices],)
-
-    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
-    drawn = inspect.signature(scene_pictures.scene_picture)
-    monkeypatch.setattr(scene_pictures, "scene_picture", lambda **inputs: drawn.bind(**inputs) and b"picture")
-    for name in ("loss_figure", "precision_recall_figure", "ap_threshold_figure"):  # each takes a second
-        monkeypatch.setattr(figures, name, lambda *_, **__: b"picture")
-    threads, level = torch.get_num_threads(), logging.getLogger("lightning.pytorch").level
-    yield
-    torch.set_num_threads(threads)
-    logging.getLogger("lightning.pytorch").setLevel(level)
+pytestmark = pytest.mark.usefixtures("quick_training")
 
 
 @pytest.fixture
