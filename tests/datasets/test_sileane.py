@@ -225,3 +225,12 @@ def test_poses_that_are_the_cameras_already_are_noticed(folder: Path, tmp_path: 
         path.write_text(json.dumps(entries))
     (error,) = check_dataset(SileaneDataset(spoilt)).errors
     assert "with poses left as they stand in the file they would" in error
+
+
+def test_cycles_and_what_a_digest_is_made_of(shared_data: Callable[[str], Path]) -> None:
+    bunny = SileaneDataset(shared_data("sileane_bunny_sample"))
+    assert {bunny.cycle_of(name) for name in bunny.names} == {"bunny_3"}
+    assert json.loads(bunny.truth_bytes("bunny_3_070"))[0]["R"]
+    assert "4507.08" in bunny.picture_rule("bunny_3_070")
+    with pytest.raises(ValueError, match="there is no scene 'bunny_3_001'"):
+        bunny.picture_rule("bunny_3_001")

@@ -8,6 +8,7 @@ OpenCV camera frame, pixel centres at whole numbers; a depth of 0 is missing.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,6 +102,17 @@ class BopDataset(Dataset):
             ) from error
         poses = poses_in_millimetres(f"{path}: image {name}", rotations, translations)
         return GroundTruth(poses, self._visible(name, len(poses)), np.array(ids, dtype=np.int32), np.arange(len(poses)))
+
+    def truth_bytes(self, name: str) -> bytes:
+        """The picture's entries of ``scene_gt.json`` and ``scene_gt_info.json``."""
+        entries, _ = self._entries(name)
+        scene, _, image = name.partition("/")
+        info = self._scene_files(scene).info
+        return json.dumps([entries, None if info is None else info.get(str(int(image)))], sort_keys=True).encode()
+
+    def picture_rule(self, name: str) -> str:
+        """The picture's entry of ``scene_camera.json``."""
+        return json.dumps(self._camera_entry(name)[1], sort_keys=True)
 
     def frame(self, name: str, labels: bool = True) -> Frame:
         """The picture of a scene; nothing in the format tells the bin from the parts but the masks."""

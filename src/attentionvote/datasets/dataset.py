@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from attentionvote.datasets.benchmark_objects import BenchmarkObject, benchmark_object
 from attentionvote.datasets.depth_image import PinholeCamera
+from attentionvote.datasets.text_files import read_json
 from attentionvote.scene import BACKGROUND, Scene
 
 # Fewer drops than these are not scored (paper section 4.1).
@@ -140,6 +141,22 @@ class Dataset(ABC):
     def missing_files(self) -> dict[str, list[str]]:
         """Names of the scenes that lack a file, by its kind (``depth``, ``gt``, ``labels``); no picture is opened."""
 
+    @abstractmethod
+    def truth_bytes(self, name: str) -> bytes:
+        """What the files say of a scene's poses and visibility, unread: digests of many thousand scenes need it.
+
+        Raises:
+            ValueError: with one sentence, when it is missing.
+        """
+
+    @abstractmethod
+    def picture_rule(self, name: str) -> str:
+        """What makes points of a scene's picture (camera, meaning of a count), as a text; no picture is opened."""
+
+    def cycle_of(self, name: str) -> str:
+        """The drop cycle (BOP: scene) that a scene belongs to: scenes of one are nearly the same picture."""
+        return self._known(name).rpartition("/")[0]
+
     @property
     def diameters(self) -> tuple[float | None, ...]:
         """D of every part in metres, where the files or the paper's Table 1 say it."""
@@ -159,6 +176,14 @@ class Dataset(ABC):
     def is_generated(self) -> bool:
         """Whether ``make write-data`` wrote it: then nobody printed how many scenes it must have."""
         return (self.directory / RECEIPT).is_file()
+
+    @property
+    def written_from(self) -> str | None:
+        """Digest of the generated scenes that ``make write-data`` wrote here; None of other data."""
+        if not self.is_generated:
+            return None
+        digest = read_json(self.directory / RECEIPT, dict).get("scene_set")
+        return digest if isinstance(digest, str) else None
 
     @property
     def scored_names(self) -> tuple[str, ...]:

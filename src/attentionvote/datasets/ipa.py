@@ -167,6 +167,14 @@ class IpaDataset(Dataset):
             )
         return truth
 
+    def truth_bytes(self, name: str) -> bytes:
+        """The CSV file."""
+        return self._file(name, "gt").read_bytes()
+
+    def picture_rule(self, name: str) -> str:
+        """What ``parameter.json`` of the scene's part says."""
+        return repr(self._parameters(name))
+
     def frame(self, name: str, labels: bool = True) -> Frame:
         """The picture of a scene; the background is the picture of the same cycle's empty bin."""
         camera = self._parameters(name).camera

@@ -165,6 +165,20 @@ class SileaneDataset(Dataset):
             labels,
         )
 
+    def truth_bytes(self, name: str) -> bytes:
+        """The JSON file."""
+        return self._file(name, "gt").read_bytes()
+
+    def picture_rule(self, name: str) -> str:
+        """What ``camera_params.txt`` says."""
+        self._known(name)
+        return f"{self._camera.camera} {self._camera.coding} {self._camera.world_from_camera.tolist()}"
+
+    def cycle_of(self, name: str) -> str:
+        """Object and cycle, ``bunny_3``; of another name the whole."""
+        part, cycle, _ = _order(self._known(name))
+        return f"{part}_{cycle}" if cycle >= 0 else name
+
     def frame(self, name: str, labels: bool = True) -> Frame:
         """The picture of a scene. The bin's floor is beyond a depth that is known for the paper's objects; for others
         the same cycle's scene without parts shows it.
