@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from attentionvote.data.dataset_split import SHORT, DatasetSplit
+from attentionvote.data.part_frame import check_part_frame
 from attentionvote.datasets import Dataset, open_datasets
 from attentionvote.geometry.pointcloud import sample_indices
-from attentionvote.geometry.pose import apply, inverse
 from attentionvote.part import Part
 from attentionvote.scene import Scene
-
-_SURFACE_POINTS = 20_000
-_FRAME_TOLERANCE = 0.03  # of D: nine of ten points of an instance must lie so near to the part's surface at its pose
-_INSTANCES = 3  # that are looked at, the most visible ones
 
 
 @dataclass(frozen=True)
@@ -74,6 +70,27 @@ class DatasetScenes:
     def __len__(self) -> int:
         return len(self.dataset.scored_names)
 
+    def check_unseen(self, trained_with: Mapping[str, str]) -> None:
+        """Whether a model has learned from none of the scenes; those of its test decided nothing.
+
+        Args:
+            trained_with: ``data`` of its card.
+
+        Raises:
+            ValueError: with one sentence.
+        """
+        kept = trained_with.get("cycles", "")
+        learned = {kept[i : i + SHORT] for i in range(0, len(kept), SHORT)}
+        cycles = DatasetSplit(self.dataset, self.dataset.scored_names, self.part).cycles
+        seen = [name for name, digest in cycles.items() if digest[:SHORT] in learned]
+        if self.dataset.written_from in trained_with.values():
+            seen = list(cycles)
+        if seen:
+            raise ValueError(
+                f"{self.dataset.directory} must hold scenes that the model was not trained with, but it was with "
+                f"{len(seen)} of the {len(cycles)} drop cycles, {seen[0]} for one: name the folder of others"
+            )
+
     def clouds(self) -> Iterator[Scene]:
         """Every scored scene without its background, at most ``density`` points."""
         for name in self.dataset.scored_names:
@@ -93,19 +110,5 @@ class DatasetScenes:
         Raises:
             ValueError: when they do not: mesh and poses are in different frames or units.
         """
-        if not self.dataset.has_labels:
-            return
-        scene = next(self.clouds())
-        surface = cKDTree(self.part.surface_points(_SURFACE_POINTS, np.random.default_rng(0)))
-        distances = []
-        for instance in np.argsort(-scene.visible_fraction)[:_INSTANCES]:
-            points = scene.points[scene.instance_ids == instance]
-            distances.append(surface.query(apply(inverse(scene.camera_from_part[instance]), points))[0])
-        found = np.concatenate(distances)
-        apart, limit = float(np.quantile(found, 0.9)) if len(found) else 0.0, _FRAME_TOLERANCE * self.part.diameter
-        if apart > limit:
-            raise ValueError(
-                f"{self.part.name} must have the frame of the poses in {self.dataset.directory} (points within "
-                f"{1000 * limit:.1f} mm of its surface), got {1000 * apart:.1f} mm: use the dataset's own mesh, in "
-                "metres and not moved"
-            )
+        if self.dataset.has_labels:
+            check_part_frame(next(self.clouds()), self.part, str(self.dataset.directory), labelled=True)

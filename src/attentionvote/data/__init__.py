@@ -1,4 +1,4 @@
-"""From scene sets to batches: measured clouds, samples, augmentation, the data module.
+"""From scene sets and datasets to batches: measured clouds, samples, augmentation, the data module.
 
 The public names are loaded on first use, so that the processes that measure clouds do not import torch.
 """

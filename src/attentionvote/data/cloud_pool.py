@@ -1,4 +1,4 @@
-"""Measures the clouds of a scene set here, in several processes or on several machines.
+"""Measures the clouds of scenes here, in several processes or on several machines.
 
 Workers measure, this process writes the rows: they lie in files that are mapped into memory, and pages that two
 machines have mapped would overwrite each other's rows.
@@ -6,18 +6,20 @@ machines have mapped would overwrite each other's rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from numpy.typing import NDArray
 
-from attentionvote.data.clouds import CloudSettings, measure, measure_into
+from attentionvote.data.clouds import CloudSettings, measure, measure_into, with_normals
+from attentionvote.data.dataset_split import DatasetSensing, DatasetSplit
 from attentionvote.execution import Executor, WorkerDied, run_all
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
-from attentionvote.simulation import PartCaster, SceneRecord
+from attentionvote.simulation import PartCaster, SceneRecord, SceneSet
 
 
 @dataclass(frozen=True)
@@ -39,20 +41,49 @@ class CloudTask:
         return PartCaster(self.part)
 
 
+@dataclass(frozen=True)
+class DatasetCloudTask:
+    """Measures a scene of a dataset by its name."""
+
+    sensing: DatasetSensing
+    settings: CloudSettings
+
+    def __call__(self, name: str) -> Scene:
+        """Its cloud."""
+        return with_normals(*self.sensing(name), self.settings)
+
+
+def jobs_of(
+    scenes: SceneSet | DatasetSplit, part: Parts, settings: CloudSettings
+) -> tuple[Sequence[Any], Callable[[Any], Scene]]:
+    """What stands for each scene, and what measures it."""
+    if isinstance(scenes, SceneSet):
+        return scenes.records, CloudTask(part, settings)
+    sensing = DatasetSensing(scenes.dataset, scenes.part, settings.sensor, settings.density)
+    return scenes.names, DatasetCloudTask(sensing, settings)
+
+
 def run_scenes(
     indices: Sequence[int],
     workers: int,
     arrays: dict[str, NDArray],
-    records: Sequence[SceneRecord],
-    task: CloudTask,
+    scenes: Sequence[Any],
+    task: Callable[[Any], Scene],
     executor: Executor | None = None,
 ) -> Iterator[None]:
-    """Measure these scenes of ``records`` into ``arrays``; yields once a scene.
+    """Measure these scenes into ``arrays``; yields once a scene.
+
+    Args:
+        indices: of ``scenes``.
+        workers: processes.
+        arrays: rows by index.
+        scenes, task: see ``jobs_of``.
+        executor: where the workers are; default this machine.
 
     Raises:
         OSError: when the worker of one scene died again and again.
     """
-    jobs = [records[index] for index in indices]
+    jobs = [scenes[index] for index in indices]
     try:
         with closing(run_all(task, jobs, executor, workers=max(1, workers))) as results:
             for job, scene in results:

@@ -1,4 +1,4 @@
-"""Point clouds of a scene set, measured once and kept on disk for all epochs.
+"""Point clouds of a scene set or of a dataset, measured once and kept on disk for all epochs.
 
 Casting the rays and estimating the normals costs a few hundred milliseconds a scene, drawing a sample from the
 stored cloud a few; so every scene is measured once with the sensor's noise, and a pool of its points is kept with
@@ -11,8 +11,10 @@ import fcntl
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,9 @@ from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
 from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor, synthesize
+
+if TYPE_CHECKING:
+    from attentionvote.data.dataset_split import DatasetSplit
 
 _VERSION = 1
 _SCENES_PER_PROCESS = 24
@@ -53,17 +58,33 @@ class CloudSettings:
         return hashlib.sha256(content.encode()).hexdigest()
 
 
+class Truth(Protocol):
+    """Where the parts of a scene are and how much of each is seen; see ``Scene``."""
+
+    @property
+    def camera_from_part(self) -> NDArray[np.float64]:
+        """``(I, 4, 4)``, metres."""
+
+    @property
+    def visible_fraction(self) -> NDArray[np.float64]:
+        """``(I,)`` in [0, 1]."""
+
+    @property
+    def part_ids(self) -> NDArray[np.int32]:
+        """``(I,)`` index of the part."""
+
+
 class Clouds:
-    """The measured clouds of a scene set; ``clouds[i]`` is scene i as a ``Scene`` with normals.
+    """The measured clouds of scenes; ``clouds[i]`` is scene i as a ``Scene`` with normals.
 
     Args:
         directory: where ``measure_clouds`` put them.
-        scenes: the scene set they belong to.
+        scenes: the scene set they belong to, or the scenes of a dataset.
     """
 
-    def __init__(self, directory: Path, scenes: SceneSet) -> None:
+    def __init__(self, directory: Path, scenes: SceneSet | DatasetSplit) -> None:
         self.directory = directory
-        self.records: list[SceneRecord] = list(scenes.records)
+        self.records: Sequence[Truth] = scenes.records
         self._arrays = open_arrays(directory, "r")
 
     def __len__(self) -> int:
@@ -109,7 +130,11 @@ def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) ->
 
     The random numbers come from the scene's own seed, so the cloud does not depend on who measures it and when.
     """
-    scene, rng = sense(record, caster, settings)
+    return with_normals(*sense(record, caster, settings), settings)
+
+
+def with_normals(scene: Scene, rng: np.random.Generator, settings: CloudSettings) -> Scene:
+    """Points of the pool of a sensed scene, with normals from all of its points; empty where there are too few."""
     if len(scene.points) < 3:
         empty = np.zeros((0, 3), dtype=np.float32)
         return Scene(
@@ -123,7 +148,7 @@ def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) ->
 
 
 def measure_clouds(
-    scenes: SceneSet,
+    scenes: SceneSet | DatasetSplit,
     part: Parts,
     settings: CloudSettings,
     root: Path,
@@ -131,13 +156,13 @@ def measure_clouds(
     progress: bool = True,
     executor: Executor | None = None,
 ) -> Clouds:
-    """Measure what is missing of a scene set's clouds and open them.
+    """Measure what is missing of the clouds of scenes and open them.
 
     A scene's row is written before its mark, so that an interrupted call, also by kill -9, goes on where it was; a
     second process waits for the first.
 
     Args:
-        scenes: the scene set.
+        scenes: the scene set, or the scenes of a dataset.
         part: its part, or set of parts.
         settings: sensor, density, pool.
         root: clouds are kept in ``root/<part>/<key>``.
@@ -158,12 +183,12 @@ def measure_clouds(
         done = open_arrays(directory, "r")["done"]
         missing = [int(i) for i in np.flatnonzero(done == 0)]
         if missing:
-            from attentionvote.data.cloud_pool import CloudTask, run_scenes
+            from attentionvote.data.cloud_pool import jobs_of, run_scenes
 
             # A process needs seconds to start, a scene a fraction of one.
             workers = min(workers, len(missing) // _SCENES_PER_PROCESS)
-            arrays, task = open_arrays(directory, "r+"), CloudTask(part, settings)
-            results = run_scenes(missing, workers, arrays, scenes.records, task, executor)
+            arrays, (jobs, task) = open_arrays(directory, "r+"), jobs_of(scenes, part, settings)
+            results = run_scenes(missing, workers, arrays, jobs, task, executor)
             if progress:
                 from rich.console import Console
                 from rich.progress import track
