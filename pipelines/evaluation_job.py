@@ -81,8 +81,12 @@ class EvaluationJob:
         from attentionvote.registry.measurement import EvaluationSet
 
         scenes = scenes_of(self.cfg, self.part)
-        made = scenes.scenes.digest if isinstance(scenes, EvaluationSet) else None
-        if made is not None and made in self.bundle.card.data.values():
+        if not isinstance(scenes, EvaluationSet):
+            from dataset_scenes import DatasetScenes
+
+            assert isinstance(scenes, DatasetScenes)
+            scenes.check_unseen(self.bundle.card.data)
+        elif (made := scenes.scenes.digest) in self.bundle.card.data.values():
             raise ValueError(
                 f"the evaluation set {made[:12]} must not be one that the model was trained with, but it is: change "
                 "simulation.seed"

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from attentionvote.contract import ModelCard
     from attentionvote.data import Clouds, CloudSettings
+    from attentionvote.data.dataset_split import DatasetSplit
     from attentionvote.export import Limits
     from attentionvote.model import AttentionVote
     from attentionvote.simulation import SceneSet
@@ -130,7 +131,8 @@ class ExportJob:
         if len(indices) < self.cfg.limits.scenes:
             raise ValueError(
                 f"the proof must have at least limits.scenes ({self.cfg.limits.scenes}) held-out scenes with parts in "
-                f"them, got {len(indices)}: train with more simulation.cycles.test, or lower limits.scenes"
+                f"them, got {len(indices)}: train with more simulation.cycles.test or data.held_out.test, or lower "
+                "limits.scenes"
             )
         run_id, commit = (str(self.trained.get(name) or "") for name in ("run_id", "commit"))
         card = model_card(model, metadata, self.part, *held_out.working_volume(clouds), run_id, commit)
@@ -188,7 +190,7 @@ class ExportWork:
     job: ExportJob
     model: AttentionVote
     card: ModelCard
-    scenes: SceneSet
+    scenes: SceneSet | DatasetSplit
     settings: CloudSettings
     clouds: Clouds
     indices: list[int]
@@ -225,15 +227,11 @@ class ExportWork:
 
     def _golden(self) -> Iterator[tuple[str, Any]]:
         """Whole clouds of held-out scenes: first the most different fillings, then whatever else there is."""
-        from attentionvote.data.clouds import sense
         from attentionvote.export import held_out
-        from attentionvote.simulation import PartCaster
 
-        caster = PartCaster(self.job.part)
         first = [self.indices[i] for i in held_out.spread(len(self.indices), self.job.cfg.golden)]
-        for index in dict.fromkeys([*first, *self.indices]):
-            record = self.scenes.records[index]
-            yield f"scene_{record.cycle:03d}_{record.drop_count:03d}", sense(record, caster, self.settings)[0].points
+        order = dict.fromkeys([*first, *self.indices])
+        yield from held_out.whole_clouds(self.scenes, self.job.part, self.settings, order)
 
 
 def _described(training: Path, result: dict[str, Any]) -> str:

@@ -60,14 +60,15 @@ def row(name: str, job: TrainingJob, answers: Mapping[str, Any], bundles: Path, 
 
 
 def stale_splits(trained_with: Mapping[str, str], job: TrainingJob, root: Path) -> list[str]:
-    """Splits whose scenes are not those that the current configuration would generate.
+    """Splits whose scenes are not those that the current configuration would generate or read.
 
     Args:
         trained_with: content digest of every split's scene set, from a model card.
         job: the training that the configuration means now.
         root: where scene sets lie; a set that is not there was never generated.
     """
-    stale = []
+    read = job.dataset.splits if job.dataset else {}
+    stale = [split for split, scenes in read.items() if trained_with.get(split) != scenes.digest]
     for split, spec in job.specs.items():
         directory = scene_set_directory(root / "scenes", job.part.name, spec)
         now = SceneSet.open(directory).digest if SceneSet.is_complete(directory) else None

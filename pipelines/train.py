@@ -1,10 +1,13 @@
 """Train a part's network: generate what is missing, train, validate, test, track.
 
     make train OBJECT=connecting_rod [PROCESSES=8] [ARGS="trainer.max_epochs=20 seed=1"]
+    make train OBJECT=gear_shaft ARGS="data.dataset=/data/ipa/training/GearShaft object.mesh=/data/ipa/GearShaft.stl"
 
 The default preset follows the hardware: compact on a CPU, gpu where there is a GPU; ARGS="experiment=paper" is the
-paper's. Interrupted, also by kill -9, the same command goes on where it was, in the same MLflow run; a training that
-is complete is not repeated without force=true. PROCESSES share every batch, one a GPU (docs/several-processes.md).
+paper's. With data.dataset=DIR the scenes are a public dataset's (docs/datasets.md): its own val and test, or drop
+cycles held out (data.held_out). Interrupted, also by kill -9, the same command goes on where it was, in the same MLflow
+run; a training that is complete is not repeated without force=true. PROCESSES share every batch, one a GPU
+(docs/several-processes.md).
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ log = logging.getLogger("attentionvote.train")
 
 
 def run(cfg: DictConfig) -> dict[str, Any] | None:
-    """Generate, train, test; the test figures and where the model is, None in all processes but the first."""
+    """Make or read scenes, train, test; test figures and where the model is, None in all processes but the first."""
     place = Place.of(os.environ)
     with first_speaks(place):
         return _run(cfg, place)
@@ -38,7 +41,7 @@ def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
     with configuring(f"object {cfg.object.name}"):
         job = find_training(cfg)
     with configuring():
-        place.check(cfg.trainer.batch_size, {s: spec.cycles * len(spec.drop_counts) for s, spec in job.specs.items()})
+        place.check(cfg.trainer.batch_size, job.scene_counts)
     # The lock comes before the meeting: a training that another process is at ends at once.
     with job.locked() if place.rank == 0 else nullcontext(), place.joined(cfg.trainer.accelerator) as first_does:
         result = job.result if place.rank == 0 else None

@@ -12,6 +12,7 @@ from training_job import TrainingJob
 from training_processes import FirstDoes, Place
 
 from attentionvote.data import Clouds, CloudSettings, measure_clouds
+from attentionvote.data.dataset_split import DatasetSplit
 from attentionvote.simulation import SceneSet, generate_scene_set, scene_set_directory
 
 _CYCLES_PER_PROCESS = 5
@@ -20,21 +21,24 @@ _CYCLES_PER_PROCESS = 5
 def prepare_data(
     cfg: DictConfig, job: TrainingJob, settings: CloudSettings, workers: int, place: Place, first_does: FirstDoes
 ) -> tuple[dict[str, Clouds], dict[str, str]]:
-    """Generate and measure what is missing, in the first process; open it in all.
+    """Generate and measure what is missing, or measure a dataset, in the first process; open it in all.
 
     Args:
         workers: processes for the work.
 
     Returns:
-        clouds and digests of the scene sets, by split.
+        clouds and digests of the scenes, by split.
 
     Raises:
         ValueError: when a process does not see what the first one has made.
     """
-    made: dict[str, tuple[Clouds, SceneSet, Path]] = {}
+    made: dict[str, tuple[Clouds, SceneSet | DatasetSplit, Path]] = {}
     executor = executor_of(cfg)
 
     def make() -> dict[str, Any]:
+        for split, read in (job.dataset.splits if job.dataset else {}).items():
+            clouds = measure_clouds(read, job.part, settings, Path(cfg.root) / "clouds", workers, executor=executor)
+            made[split] = clouds, read, read.dataset.directory
         for split, spec in job.specs.items():
             directory = scene_set_directory(Path(cfg.root) / "scenes", job.part.name, spec)
             # A process needs seconds to start, about as long as a cycle takes.
@@ -48,20 +52,25 @@ def prepare_data(
     digests = {split: digest for split, (*_, digest) in found.items()}
     if made:
         return {split: clouds for split, (clouds, *_) in made.items()}, digests
-    return {split: _open(cfg, place, *where) for split, where in found.items()}, digests
+    read_here = job.dataset.splits if job.dataset else {}
+    return {split: _open(cfg, place, read_here.get(split), *where) for split, where in found.items()}, digests
 
 
-def _open(cfg: DictConfig, place: Place, scenes: str, clouds: str, digest: str) -> Clouds:
+def _open(
+    cfg: DictConfig, place: Place, read_here: DatasetSplit | None, scenes: str, clouds: str, digest: str
+) -> Clouds:
     unseen = [path for path in (scenes, clouds) if not Path(path).is_dir()]
     if unseen:
         raise ValueError(
             f"root={cfg.root} must be a folder that all processes share, but {place.name} on {socket.gethostname()} "
             f"does not find {unseen[0]}"
         )
-    opened = SceneSet.open(Path(scenes))
+    opened = read_here or SceneSet.open(Path(scenes))
     if opened.digest != digest:
         raise ValueError(
             f"{scenes} must hold the same scenes for all processes, but {place.name} on {socket.gethostname()} finds "
             f"{opened.digest[:12]} instead of {digest[:12]}: share root={cfg.root}"
+            + " and the dataset"
+            * bool(read_here)
         )
     return Clouds(Path(clouds), opened)

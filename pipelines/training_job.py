@@ -7,19 +7,22 @@ import json
 import logging
 import shutil
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from executors import executor_of
 from folder_lock import locked_folder
 from hydra.utils import instantiate
 from json_files import read_json
 from omegaconf import DictConfig, OmegaConf
-from several_parts import check_classes
+from several_parts import check_classes, only_part
 
 from attentionvote.part import Parts
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_specs
+
+if TYPE_CHECKING:
+    from attentionvote.data.dataset_splits import DatasetSplits
 
 log = logging.getLogger("attentionvote.train")
 # What may change between two calls that mean the same training: it does not change what is learned.
@@ -32,11 +35,26 @@ RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """One training: ``directory`` for its files, the ``part`` (or set), and the scene sets it needs by split."""
+    """One training.
+
+    Attributes:
+        directory: for its files.
+        part: what it looks for, or a set of parts.
+        specs: of the scene sets it needs, by split; empty with a dataset.
+        dataset: whose scenes it takes instead.
+    """
 
     directory: Path
     part: Parts
     specs: dict[str, SceneSetSpec]
+    dataset: DatasetSplits | None = None
+
+    @property
+    def scene_counts(self) -> dict[str, int]:
+        """Number of scenes by split."""
+        if self.dataset is not None:
+            return {split: len(scenes) for split, scenes in self.dataset.splits.items()}
+        return {split: spec.cycles * len(spec.drop_counts) for split, spec in self.specs.items()}
 
     @property
     def run_id(self) -> str | None:
@@ -74,7 +92,13 @@ def find_training(cfg: DictConfig) -> TrainingJob:
     part: Parts = instantiate(cfg.object)
     specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation, resolve=True))
     check_classes(cfg.model.classes, part)
-    _check(cfg, specs)
+    for split in ("train", "val", "test"):
+        if split not in specs:
+            raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
+    job = TrainingJob(Path(cfg.outputs) / part.name, part, specs)
+    if cfg.data.dataset is not None:
+        job = replace(job, specs={}, dataset=_dataset(cfg, part))
+    _check(cfg, job.scene_counts["train"])
     plain = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(plain, dict)
     for key in NOT_IDENTITY:
@@ -82,20 +106,31 @@ def find_training(cfg: DictConfig) -> TrainingJob:
         (plain[section] if section else plain).pop(leaf, None)
     if len(part.parts) > 1:  # whether the number was also typed makes no other training
         plain["model"]["classes"] = len(part.parts)
+    del plain["data"]["held_out"]  # what was trained without a dataset keeps its digest
+    if job.dataset is None:
+        del plain["data"]["dataset"]
+    else:  # the scenes are the identity, wherever they lie
+        del plain["simulation"]
+        plain["data"]["dataset"] = {split: scenes.digest for split, scenes in job.dataset.splits.items()}
     digest = hashlib.sha256(json.dumps([plain, part.digest], sort_keys=True).encode()).hexdigest()
-    return TrainingJob(Path(cfg.outputs) / part.name / digest[:12], part, specs)
+    return replace(job, directory=job.directory / digest[:12])
 
 
-def _check(cfg: DictConfig, specs: dict[str, SceneSetSpec]) -> None:
+def _dataset(cfg: DictConfig, part: Parts) -> DatasetSplits:
+    from attentionvote.data.dataset_split import check_sensor
+    from attentionvote.data.dataset_splits import DatasetSplits
+
+    check_sensor(Sensor(**cfg.data.sensor))
+    only = only_part(part, "data.dataset")
+    return DatasetSplits.open(Path(cfg.data.dataset), only, {str(k): float(v) for k, v in cfg.data.held_out.items()})
+
+
+def _check(cfg: DictConfig, scenes: int) -> None:
     from attentionvote.tracking.store import resolve_store
 
     resolve_store(cfg.tracking.store)
     executor_of(cfg)
     Sensor(**cfg.data.sensor)
-    for split in ("train", "val", "test"):
-        if split not in specs:
-            raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
-    scenes = specs["train"].cycles * len(specs["train"].drop_counts)
     if cfg.trainer.batch_size > scenes:
         raise ValueError(
             f"trainer.batch_size must be at most the {scenes} training scenes, got {cfg.trainer.batch_size}"

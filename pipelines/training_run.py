@@ -16,14 +16,15 @@ from hydra.utils import instantiate
 from json_files import write_json
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from several_parts import described, network_arguments
 from sweep_trial import best_score, trial_callbacks
 from training_data import prepare_data
-from training_job import MODEL, RESULT, RUN, TrainingJob
+from training_job import MODEL, RESULT, TrainingJob
 from training_messages import plain_loader_errors, quiet_lightning
 from training_processes import FirstDoes, Place
 from training_results import Found, assess, detect_everything, log_losses
+from training_tracking import open_tracking
 
 from attentionvote import __version__
 from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule
@@ -102,6 +103,9 @@ class TrainingRun:
             connect(resolve_store(self.cfg.tracking.store))  # said before the scenes are made, not after
         clouds, digests = prepare_data(self.cfg, self.job, self.clouds, self.workers, self.place, self.first_does)
         self.module.metadata["data"] |= digests
+        if self.job.dataset is not None:
+            self.module.metadata["data"] |= self.job.dataset.evidence
+            self.module.metadata["dataset"] = self.job.dataset.described()
         data_seconds = time.monotonic() - start
         with plain_loader_errors(), quiet_lightning():
             data = self._data_module(clouds)
@@ -109,7 +113,7 @@ class TrainingRun:
                 self._fit(data, None)
                 self._detect(data)
                 return None
-            with self._open_tracking(clouds) as tracked:
+            with open_tracking(self.cfg, self.job, self.module, self.place.processes) as tracked:
                 progress = self._fit(data, tracked)
                 losses = log_losses(tracked)
                 weights, found = self._detect(data)
@@ -144,7 +148,9 @@ class TrainingRun:
 
     def _introduce(self) -> None:
         """One line on what is chosen."""
-        counts = {split: spec.cycles * len(spec.drop_counts) for split, spec in self.job.specs.items()}
+        counts = self.job.scene_counts
+        if self.job.dataset is not None:
+            log.info("scenes of %s: %s", self.job.dataset.folder, self.job.dataset)
         log.info(
             "%s: %d/%d/%d scenes (train/val/test), %d points, %s parameters, %d epochs of batches of %d "
             "on %s (%s, %d thread%s%s)%s",
@@ -171,43 +177,6 @@ class TrainingRun:
             self.place.rank,
             self.place.processes,
         )
-
-    def _open_tracking(self, clouds: dict[str, Clouds]) -> Any:
-        from attentionvote import tracking
-
-        cfg = self.cfg
-        choices = {
-            "object": self.part.name,
-            "diameter": self.part.diameter,
-            "seed": cfg.seed,
-            "points": cfg.data.points,
-            "parameters": sum(p.numel() for p in self.module.model.parameters()),
-            "train_scenes": len(clouds["train"]),
-            "epochs": cfg.trainer.max_epochs,
-            "batch_size": cfg.trainer.batch_size,
-            "learning_rate": cfg.trainer.learning_rate,
-        }
-        settings = {
-            "store": cfg.tracking.store,
-            "experiment": self.part.name,
-            "name": f"{self.part.name}-{self.job.directory.name}",
-            "params": choices,
-            "tags": {"processes": self.place.processes},
-            "config_yaml": OmegaConf.to_yaml(cfg, resolve=True),
-            "datasets": self.module.metadata["data"],
-            "system_interval_s": cfg.tracking.system_interval,
-            "parent": cfg.tracking.parent,
-        }
-        run_id = self.job.run_id
-        try:
-            run = tracking.start_run(run_id=run_id, **settings)
-        except ValueError:
-            if run_id is None:
-                raise
-            log.warning("the MLflow run %s is gone from the store: the training goes on in a new one", run_id)
-            run = tracking.start_run(run_id=None, **settings)
-        write_json(self.job.directory / RUN, {"run_id": run.id})
-        return run
 
     def _trainer(self) -> L.Trainer:
         t, folder = self.cfg.trainer, self._checkpoints

@@ -88,7 +88,8 @@ class ModelCard:
         voting_radius: metres in which the graph gathers votes where that is not the training's; None where it is.
         distance: nearest and farthest depth (metres) of the clouds the model was trained for.
         extent: largest side of the axis-parallel box around such a cloud, metres.
-        data: digests of the scene sets by split.
+        data: digests of the scenes by split; of a dataset's also ``cycles``, the first eight digits of the digest of
+            every drop cycle that was learned from, and ``scene_set`` where the dataset was written from one.
         run_id: of the MLflow run; empty when there was none.
         commit: of the code that trained it; ends with ``+dirty`` when there were uncommitted changes.
         versions: of the packages that made the graph.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import pytest
 import write_data
 from configuration import ConfigurationError, compose
 from dataset_scenes import DatasetScenes
+from evaluation_job import EvaluationJob
 from hydra.utils import instantiate
+
+from attentionvote.data.dataset_split import DatasetSplit
 
 WRITTEN = ["object=brick", "simulation=smoke", "simulation.drop_counts=[2,5]", "split=test", "workers=1"]
 
@@ -67,3 +71,21 @@ def test_evaluate_measures_on_a_dataset(ipa: Path, export_brick: Any) -> None:
     assert 0 <= result["figures"]["ap_10"] <= 1
     with pytest.raises(ConfigurationError):
         evaluate.run(compose("evaluate", [*words[:1], "evaluation.dataset=/nowhere"]))
+
+
+def test_scenes_that_the_model_learned_from_are_refused(ipa: Path, brick: Any, export_brick: Any) -> None:
+    export_brick("model")
+    job = EvaluationJob.find(compose("evaluate", ["object=brick", f"evaluation.dataset={ipa}"]))
+    dataset = DatasetScenes.find(ipa, brick, 1000).dataset
+    learned = DatasetSplit(dataset, dataset.scored_names, brick)
+    assert len(job.evaluation_set()) == 1
+    for data, refused in (
+        ({"train": learned.digest, "cycles": "0" * 8 + learned.fingerprint}, True),
+        ({"train": str(dataset.written_from)}, True),  # trained with the generated scenes themselves
+        ({"test": learned.digest, "cycles": "0" * 16}, False),  # a training's test decides nothing
+    ):
+        card = replace(job.bundle.card, data=data)
+        trained = replace(job, bundle=replace(job.bundle, card=card))
+        message = "the model was not trained with, but it was with 1 of the 1 drop cycles, cycle_0000 for one"
+        with pytest.raises(ValueError, match=message) if refused else nullcontext():
+            trained.evaluation_set()

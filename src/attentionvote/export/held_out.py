@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from attentionvote.data import Clouds, CloudSettings, collate, draw_sample, measure_clouds
+from attentionvote.data.clouds import sense
+from attentionvote.data.dataset_split import DatasetSensing, DatasetSplit
+from attentionvote.data.dataset_splits import DatasetSplits
 from attentionvote.data.samples import Batch
+from attentionvote.datasets import UnknownLayout
 from attentionvote.model import Layout
 from attentionvote.part import Parts
-from attentionvote.simulation import SceneSet, Sensor
+from attentionvote.simulation import PartCaster, SceneSet, Sensor
 
 
 def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:
@@ -21,8 +26,8 @@ def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:
     return CloudSettings(**(stored | {"sensor": Sensor(**stored["sensor"])}))
 
 
-def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> SceneSet:
-    """The test scenes of a training, below ``root/scenes/PART``.
+def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> SceneSet | DatasetSplit:
+    """The test scenes of a training, below ``root/scenes/PART``, or where the dataset was that it took.
 
     Args:
         metadata: of the checkpoint; ``data.test`` is the content's digest.
@@ -39,6 +44,8 @@ def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> Scene
             f"{part.digest[:12]}: its mesh, diameter or symmetry has changed, train it again"
         )
     wanted = metadata["data"].get("test", "")
+    if metadata.get("dataset"):
+        return _read_again(metadata["dataset"], part, wanted)
     for manifest in sorted((root / "scenes" / part.name).glob("test-*/manifest.json")):
         if SceneSet.is_complete(manifest.parent):
             scenes = SceneSet.open(manifest.parent)
@@ -50,9 +57,37 @@ def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> Scene
     )
 
 
-def measured(scenes: SceneSet, part: Parts, settings: CloudSettings, root: Path, workers: int) -> Clouds:
+def _read_again(kept: dict[str, Any], part: Parts, wanted: str) -> DatasetSplit:
+    folder = Path(kept["folder"])
+    try:
+        found = DatasetSplits.open(folder, part.parts[0], kept["held_out"]).splits["test"]
+    except UnknownLayout as error:
+        raise ValueError(f"the dataset that the network was trained on must be where it was: {error}") from error
+    if found.digest != wanted:
+        raise ValueError(
+            f"{folder} must hold the test scenes {wanted[:12]} that the network was trained with, got "
+            f"{found.digest[:12]}: the dataset has changed, train it again"
+        )
+    return found
+
+
+def measured(scenes: SceneSet | DatasetSplit, part: Parts, settings: CloudSettings, root: Path, workers: int) -> Clouds:
     """The clouds of the scenes as the training saw them; measured again where they are gone."""
     return measure_clouds(scenes, part, settings, root / "clouds", workers)
+
+
+def whole_clouds(
+    scenes: SceneSet | DatasetSplit, part: Parts, settings: CloudSettings, indices: Iterable[int]
+) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Name and points ``(P, 3)`` of these scenes as the sensor delivers them, up to ``density`` points."""
+    if isinstance(scenes, SceneSet):
+        caster = PartCaster(part)
+        for record in (scenes.records[index] for index in indices):
+            yield f"scene_{record.cycle:03d}_{record.drop_count:03d}", sense(record, caster, settings)[0].points
+        return
+    sensing = DatasetSensing(scenes.dataset, scenes.part, settings.sensor, settings.density)
+    for name in (scenes.names[index] for index in indices):
+        yield "scene_" + name.replace("/", "_"), sensing(name)[0].points
 
 
 def spread(total: int, count: int) -> list[int]:

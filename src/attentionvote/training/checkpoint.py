@@ -101,7 +101,8 @@ def load_trained(path: Path | str) -> tuple[AttentionVote, dict[str, Any]]:
     * ``parts``: of a set the same of each, in the order of the classes; ``part`` is then the set, without symmetry;
     * ``points``: N of a sample; ``clouds``: sensor, density, pool and neighbours of the normals;
     * ``peak_threshold``; ``confidence_threshold``: None before the test;
-    * ``data``: digests of the scene sets by split; ``test``: the test's figures, empty before it.
+    * ``data``: digests of the scenes by split; of a dataset's also ``cycles``, see ``data.dataset_splits``;
+    * ``dataset``: where a dataset's scenes were and how they were split; ``test``: figures, empty before the test.
 
     Raises:
         ValueError: with one sentence, when the file cannot be read or is none of this project's.
