@@ -5,6 +5,7 @@
  * maximum vectorises only then. Never with -ffast-math: linked into a shared object it makes GCC flush
  * subnormals to zero in the whole process.
  */
+#include <float.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -12,26 +13,57 @@
 
 #define BLOCK 64
 #define MAX_CELLS_PER_AXIS 1024
+#define DIGIT 11 /* bits a pass of the sort */
 
 typedef struct {
-    uint64_t key;
+    uint32_t key;
     int32_t index;
 } keyed;
 
-static int by_key(const void *a, const void *b) {
-    const keyed *x = a, *y = b;
-    if (x->key != y->key) return x->key < y->key ? -1 : 1;
-    return x->index < y->index ? -1 : (x->index > y->index);
+static uint32_t spread(uint32_t v) { /* 10 bits, two zero bits between neighbours */
+    v = (v | v << 16) & 0x030000ffu;
+    v = (v | v << 8) & 0x0300f00fu;
+    v = (v | v << 4) & 0x030c30c3u;
+    v = (v | v << 2) & 0x09249249u;
+    return v;
 }
 
-static uint64_t spread(uint64_t v) { /* 21 bits, two zero bits between neighbours */
-    v &= 0x1fffff;
-    v = (v | v << 32) & 0x1f00000000ffffULL;
-    v = (v | v << 16) & 0x1f0000ff0000ffULL;
-    v = (v | v << 8) & 0x100f00f00f00f00fULL;
-    v = (v | v << 4) & 0x10c30c30c30c30c3ULL;
-    v = (v | v << 2) & 0x1249249249249249ULL;
-    return v;
+/* Indices of the points along a Morton curve through 1024 cells an axis, points of one cell in index order: points that
+ * are near each other in space mostly are so in the order. Returns 0, or 1 when memory runs out. */
+int morton_order(const float *xyz, int32_t n, int32_t *order) {
+    keyed *from = malloc(sizeof(keyed) * ((size_t)n + 1)), *to = malloc(sizeof(keyed) * ((size_t)n + 1));
+    if (!from || !to) {
+        free(from), free(to);
+        return 1;
+    }
+    float low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
+    for (int a = 0; a < 3 && n > 0; a++) low[a] = high[a] = xyz[a];
+    for (int32_t i = 0; i < n; i++)
+        for (int a = 0; a < 3; a++) {
+            const float v = xyz[3 * i + a];
+            low[a] = v < low[a] ? v : low[a];
+            high[a] = v > high[a] ? v : high[a];
+        }
+    float extent = 1e-12f;
+    for (int a = 0; a < 3; a++)
+        if (high[a] - low[a] > extent) extent = high[a] - low[a];
+    for (int32_t i = 0; i < n; i++) {
+        uint32_t key = 0;
+        for (int a = 0; a < 3; a++) key |= spread((uint32_t)((xyz[3 * i + a] - low[a]) / extent * 1023.0f)) << a;
+        from[i].key = key;
+        from[i].index = i;
+    }
+    for (int shift = 0; shift < 30; shift += DIGIT) { /* stable: equal keys stay in index order */
+        int32_t start[(1 << DIGIT) + 1] = {0};
+        for (int32_t i = 0; i < n; i++) start[((from[i].key >> shift) & ((1 << DIGIT) - 1)) + 1]++;
+        for (int d = 0; d < 1 << DIGIT; d++) start[d + 1] += start[d];
+        for (int32_t i = 0; i < n; i++) to[start[(from[i].key >> shift) & ((1 << DIGIT) - 1)]++] = from[i];
+        keyed *t = from;
+        from = to, to = t;
+    }
+    for (int32_t i = 0; i < n; i++) order[i] = from[i].index;
+    free(from), free(to);
+    return 0;
 }
 
 /* Farthest-point order: order[0] = 0, then always the point farthest from all chosen ones, ties to the lowest
@@ -39,42 +71,22 @@ static uint64_t spread(uint64_t v) { /* 21 bits, two zero bits between neighbour
  * the new sample can be nearer than the block's current maximum. Returns 0, or 1 when memory runs out. */
 int farthest_point_order(const float *xyz, int32_t n, int32_t m, int32_t *order) {
     const int32_t blocks = (n + BLOCK - 1) / BLOCK, padded = blocks * BLOCK;
-    keyed *keys = malloc(sizeof(keyed) * (size_t)n);
     float *soa = malloc(sizeof(float) * 4 * (size_t)padded);
     int32_t *original = malloc(sizeof(int32_t) * (size_t)padded);
-    float *box = malloc(sizeof(float) * 7 * (size_t)blocks);
-    int32_t *best = malloc(sizeof(int32_t) * (size_t)blocks);
-    if (!keys || !soa || !original || !box || !best) {
-        free(keys), free(soa), free(original), free(box), free(best);
+    float *box = malloc(sizeof(float) * 8 * (size_t)blocks);
+    if (!soa || !original || !box || morton_order(xyz, n, original)) {
+        free(soa), free(original), free(box);
         return 1;
     }
-    float low[3], high[3];
-    for (int a = 0; a < 3; a++) low[a] = high[a] = xyz[a];
-    for (int32_t i = 0; i < n; i++)
-        for (int a = 0; a < 3; a++) {
-            const float v = xyz[3 * i + a];
-            if (v < low[a]) low[a] = v;
-            if (v > high[a]) high[a] = v;
-        }
-    float extent = 1e-12f;
-    for (int a = 0; a < 3; a++)
-        if (high[a] - low[a] > extent) extent = high[a] - low[a];
-    for (int32_t i = 0; i < n; i++) {
-        uint64_t key = 0;
-        for (int a = 0; a < 3; a++) key |= spread((uint64_t)((xyz[3 * i + a] - low[a]) / extent * 127.0f)) << a;
-        keys[i].key = key;
-        keys[i].index = i;
-    }
-    qsort(keys, (size_t)n, sizeof(keyed), by_key);
+    for (int32_t i = n; i < padded; i++) original[i] = original[n - 1];
     float *x = soa, *y = soa + padded, *z = soa + 2 * padded, *d = soa + 3 * padded;
     for (int32_t i = 0; i < padded; i++) {
-        const int32_t j = keys[i < n ? i : n - 1].index;
+        const int32_t j = original[i];
         x[i] = xyz[3 * j], y[i] = xyz[3 * j + 1], z[i] = xyz[3 * j + 2];
-        original[i] = j;
-        d[i] = i < n ? INFINITY : -1.0f; /* padding is never the farthest */
+        d[i] = i < n ? FLT_MAX : -1.0f; /* padding is never the farthest */
     }
     float *lx = box, *hx = box + blocks, *ly = box + 2 * blocks, *hy = box + 3 * blocks, *lz = box + 4 * blocks,
-          *hz = box + 5 * blocks, *farthest = box + 6 * blocks;
+          *hz = box + 5 * blocks, *farthest = box + 6 * blocks, *bound = box + 7 * blocks;
     for (int32_t b = 0; b < blocks; b++) {
         const int32_t s = b * BLOCK;
         lx[b] = hx[b] = x[s], ly[b] = hy[b] = y[s], lz[b] = hz[b] = z[s];
@@ -83,19 +95,22 @@ int farthest_point_order(const float *xyz, int32_t n, int32_t m, int32_t *order)
             ly[b] = y[i] < ly[b] ? y[i] : ly[b], hy[b] = y[i] > hy[b] ? y[i] : hy[b];
             lz[b] = z[i] < lz[b] ? z[i] : lz[b], hz[b] = z[i] > hz[b] ? z[i] : hz[b];
         }
-        farthest[b] = INFINITY;
-        best[b] = s;
+        farthest[b] = FLT_MAX;
     }
     int32_t chosen = 0;
     for (int32_t step = 0; step < m; step++) {
         order[step] = chosen;
         const float px = xyz[3 * chosen], py = xyz[3 * chosen + 1], pz = xyz[3 * chosen + 2];
-        for (int32_t b = 0; b < blocks; b++) {
-            float dx = px < lx[b] ? lx[b] - px : (px > hx[b] ? px - hx[b] : 0.0f);
-            float dy = py < ly[b] ? ly[b] - py : (py > hy[b] ? py - hy[b] : 0.0f);
-            float dz = pz < lz[b] ? lz[b] - pz : (pz > hz[b] ? pz - hz[b] : 0.0f);
+        for (int32_t b = 0; b < blocks; b++) { /* without branches: four boxes at a time */
+            float dx = lx[b] - px > px - hx[b] ? lx[b] - px : px - hx[b];
+            float dy = ly[b] - py > py - hy[b] ? ly[b] - py : py - hy[b];
+            float dz = lz[b] - pz > pz - hz[b] ? lz[b] - pz : pz - hz[b];
+            dx = dx > 0.0f ? dx : 0.0f, dy = dy > 0.0f ? dy : 0.0f, dz = dz > 0.0f ? dz : 0.0f;
             /* The slack covers rounding of the bound, so that pruning never changes the result. */
-            if ((dx * dx + dy * dy + dz * dz) * 0.99999f >= farthest[b]) continue;
+            bound[b] = (dx * dx + dy * dy + dz * dz) * 0.99999f;
+        }
+        for (int32_t b = 0; b < blocks; b++) {
+            if (bound[b] >= farthest[b]) continue;
             const int32_t s = b * BLOCK;
             float top = -1.0f;
             for (int32_t i = s; i < s + BLOCK; i++) {
@@ -105,20 +120,18 @@ int farthest_point_order(const float *xyz, int32_t n, int32_t m, int32_t *order)
                 top = top > d[i] ? top : d[i];
             }
             farthest[b] = top;
-            int32_t winner = s;
-            int32_t lowest = INT32_MAX;
-            for (int32_t i = s; i < s + BLOCK; i++)
-                if (d[i] == top && original[i] < lowest) lowest = original[i], winner = i;
-            best[b] = winner;
         }
         float top = -2.0f;
         for (int32_t b = 0; b < blocks; b++) top = top > farthest[b] ? top : farthest[b];
         int32_t lowest = INT32_MAX;
-        for (int32_t b = 0; b < blocks; b++)
-            if (farthest[b] == top && original[best[b]] < lowest) lowest = original[best[b]];
+        for (int32_t b = 0; b < blocks; b++) {
+            if (farthest[b] != top) continue;
+            for (int32_t i = b * BLOCK; i < (b + 1) * BLOCK; i++)
+                if (d[i] == top && original[i] < lowest) lowest = original[i];
+        }
         chosen = lowest;
     }
-    free(keys), free(soa), free(original), free(box), free(best);
+    free(soa), free(original), free(box);
     return 0;
 }
 
