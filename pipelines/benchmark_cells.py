@@ -63,12 +63,11 @@ def network_cell(
     if answers.get("failed"):
         raise CellFailed(f"{answers['failed']} failed, {answers['sentence']}")
     trained, evaluated = answers["train"], answers["evaluate"]
-    spec = job.specs["train"]
     return {key: evaluated[key] for key in _KEPT} | {
         "budget": {
             "steps": trained["steps"],
             "train_seconds": trained["train_seconds"],
-            "train_scenes": spec.cycles * len(spec.drop_counts),
+            "train_scenes": job.scene_counts["train"],
         },
         "seed": cfg.seed,
         "commit": trained["commit"],
