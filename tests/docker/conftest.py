@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
 import http.client
 import io
 import json
 import os
 import re
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from cell_image import CannotBuildError, fetch_wheels
 from numpy.typing import NDArray
 
 from attentionvote.contract import CARD_KEY, ModelCard, PartCard
@@ -222,43 +219,12 @@ def stages() -> dict[str, dict[str, Any]]:
 
 
 @pytest.fixture(scope="session")
-def cache() -> Path:
-    """A folder outside the repository where bases and wheels survive until the next run."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "attentionvote-ci"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def wheels(cache: Path) -> Path:
-    """The files of requirements.txt and requirements-build.txt, fetched with their hashes from pip's own index."""
-    names = [ROOT / "docker" / name for name in ("requirements.txt", "requirements-build.txt")]
-    digest = hashlib.sha256(b"".join(name.read_bytes() for name in names)).hexdigest()[:16]
-    folder = cache / f"wheels-{digest}"
-    with (cache / "wheels.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "complete").exists():
-            pip = [
-                sys.executable,
-                "-m",
-                "pip",
-                "download",
-                "--quiet",
-                "--require-hashes",
-                "--no-deps",
-                "-d",
-                str(folder),
-            ]
-            done = subprocess.run(
-                [*pip, *(word for name in names for word in ("-r", str(name)))],
-                capture_output=True, text=True, check=False,
-            )  # fmt: skip
-            if done.returncode and "HASH" in done.stderr:
-                pytest.fail(f"the locked hashes are not those of pip's index: {done.stderr}")
-            if done.returncode:
-                pytest.skip(f"pip cannot fetch the locked wheels here: {done.stderr.strip().splitlines()[-1]}")
-            (folder / "complete").touch()
-    return folder
+def wheels() -> Path:
+    """The locked packages' files; skips where pip cannot fetch them."""
+    try:
+        return fetch_wheels()
+    except CannotBuildError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture

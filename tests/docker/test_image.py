@@ -1,7 +1,6 @@
-"""The real image, built without any image registry: Debian's buildah on a base made by debootstrap.
+"""The real image, built without any image registry (tests/fixtures/cell_image.py).
 
-The base and the wheels are kept in the cache folder, so a second run takes what is new. Where this cannot be done the
-tests say why, and test_serving_environment.py is what is left.
+Where this cannot be done the tests say why, and test_serving_environment.py is what is left.
 """
 
 from __future__ import annotations
@@ -15,91 +14,36 @@ import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from cell_image import NAME, CannotBuildError, Tools, build_image, find_tools
 
 if TYPE_CHECKING:
     from conftest import Cell
 
-ROOT = Path(__file__).resolve().parents[2]
-NAME = "localhost/attentionvote:ci"
 USER = 65532
 MOST_BYTES = 300 * 10**6
-MOST_CACHE_MB = 6000  # every change of the sources leaves a quarter of a gigabyte
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-@dataclass(frozen=True)
-class Tools:
-    """buildah and this project's scripts, with a store of images of their own.
-
-    Attributes:
-        environment: of every command.
-    """
-
-    environment: dict[str, str]
-
-    def run(self, *command: str | Path, **more: str) -> str:
-        """The output of a command.
-
-        Raises:
-            OSError: when it fails, with the end of what it said.
-        """
-        environment = {**self.environment, **more}
-        done = subprocess.run(
-            [*map(str, command)], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            raise OSError(f"{command[0]} ended with {done.returncode}: {(done.stdout + done.stderr)[-3000:]}")
-        return done.stdout
-
-
 @pytest.fixture(scope="module")
-def tools(cache: Path) -> Tools:
+def tools() -> Tools:
     """The tools, or a skip that says what is missing."""
-    if missing := [name for name in ("buildah", "debootstrap") if shutil.which(name) is None]:
-        pytest.skip(f"an image needs {' and '.join(missing)}: install them (Debian: buildah debootstrap)")
-    if os.geteuid() != 0:
-        pytest.skip("an image is built by root here: debootstrap and buildah's chroot isolation mount file systems")
-    store, settings = cache / "containers", cache / "storage.conf"
-    settings.write_text(f'[storage]\ndriver = "overlay"\ngraphroot = "{store}/graph"\nrunroot = "{store}/run"\n')
-    chosen = {"CONTAINERS_STORAGE_CONF": str(settings), "BUILDAH_ISOLATION": "chroot", "BUILDER": "buildah"}
-    found = Tools({**os.environ, **chosen})
     try:
-        if store.exists() and int(found.run("du", "-sm", store).split()[0]) > MOST_CACHE_MB:
-            found.run("buildah", "rmi", "--all", "--force")
-        probe = found.run("buildah", "from", "scratch").strip()
-        found.run("buildah", "mount", probe)
-        found.run("buildah", "rm", probe)
-    except OSError as error:
-        pytest.skip(f"buildah cannot mount an image on this machine: {error}")
-    return found
+        return find_tools()
+    except CannotBuildError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")
-def base(tools: Tools) -> str:
-    """The name of the base image."""
-    script = ROOT / "docker" / "debian_base.sh"
-    name = f"localhost/attentionvote-base:{sha256(script.read_bytes()).hexdigest()[:12]}"
-    try:
-        tools.run("buildah", "inspect", "--type", "image", name)
-    except OSError:
-        try:
-            tools.run(script, name)
-        except OSError as error:
-            pytest.skip(f"debootstrap cannot make a base on this machine: {error}")
-    return name
-
-
-@pytest.fixture(scope="module")
-def image(tools: Tools, base: str, wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def image(tools: Tools) -> dict[str, Any]:
     """The built image's configuration."""
-    settings = tmp_path_factory.mktemp("pip") / "pip.conf"
-    settings.write_text("[global]\nno-index = true\nfind-links = /mnt\n")
-    tools.run(ROOT / "docker" / "build.sh", NAME, "--volume", f"{wheels}:/mnt:ro", BASE=base, PIP_CONF=str(settings))
+    try:
+        build_image(tools)
+    except CannotBuildError as error:
+        pytest.skip(str(error))
     return dict(json.loads(tools.run("buildah", "inspect", "--type", "image", NAME))["Docker"]["config"])
 
 
