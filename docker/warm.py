@@ -33,8 +33,9 @@ def main() -> None:
     The bytecode is not compared with its source's date: copies between layers change dates, and nothing changes in a
     read-only image.
     """
-    if native.load("attentionvote.geometry", "pointops.c") is None:
-        sys.exit("warm: the point operators were not compiled")
+    for file in ("pointops.c", "normals.c"):
+        if native.load("attentionvote.geometry", file) is None:
+            sys.exit(f"warm: {file} was not compiled")
     for module in pkgutil.walk_packages(attentionvote.inference.__path__, "attentionvote.inference."):
         importlib.import_module(module.name)
     for name in LATE:

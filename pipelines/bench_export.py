@@ -13,6 +13,7 @@ from bench_row import Contest, Unequal
 from bench_rows import EAGER, GRAPH
 from numpy.typing import NDArray
 
+from attentionvote.geometry import native
 from attentionvote.inference import PoseEstimator
 from attentionvote.inference.bundle import Bundle
 from attentionvote.inference.preparation import prepare
@@ -56,6 +57,8 @@ def graph(material: Material, size: str) -> Contest:
 
 def cell(material: Material, size: str) -> Contest:
     """The shipped estimator on a cloud as dense as its card allows, beside the graph on what it prepared."""
+    for file in ("pointops.c", "normals.c"):  # as in the cell's image; a cell compiles nothing
+        native.load("attentionvote.geometry", file)
     card, model = material.card(size), material.graph(size)
     estimator = PoseEstimator(Bundle(material.folder, card, "0" * 64, model))
     session, cloud = Session(model, card), material.sensed(card.density)

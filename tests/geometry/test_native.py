@@ -49,6 +49,14 @@ def test_a_library_made_elsewhere_needs_neither_compiler_nor_a_writable_folder(
         empty_cache.chmod(0o755)
 
 
+def test_a_cell_takes_what_was_made_before_and_makes_nothing(empty_cache: Path) -> None:
+    assert native.load("attentionvote.geometry", "pointops.c", make=False) is None
+    assert not empty_cache.exists()
+    if native.shutil.which("cc") is not None:
+        made = native.load("attentionvote.geometry", "pointops.c")
+        assert native.load("attentionvote.geometry", "pointops.c", make=False) is made
+
+
 @pytest.mark.usefixtures("empty_cache")
 def test_without_a_compiler_there_is_no_library_and_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native.shutil, "which", lambda _: None)

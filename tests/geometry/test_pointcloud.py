@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from attentionvote.geometry.pointcloud import back_project, estimate_normals, sample_indices
+from attentionvote.geometry import native
+from attentionvote.geometry.pointcloud import (
+    back_project,
+    estimate_normals,
+    estimate_normals_reference,
+    sample_indices,
+)
 
 CAMERA = {"fx": 500.0, "fy": 400.0, "cx": 3.5, "cy": 2.5}
 
@@ -65,6 +73,64 @@ def test_normals_equal_the_slow_reference(seed: int) -> None:
     assert normals.dtype == np.float32
     cosine = (normals * slow_normals(points, points[:20], 25)).sum(1)
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.05  # float32 answers resolve about 0.03 degrees
+
+
+def clouds(kind: str, seed: int, count: int) -> np.ndarray:
+    """Points half a metre away."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.1, 0.1, (count, 3)) + np.array([0, 0, 0.5])
+    if kind == "sheet":  # as a sensor gives it
+        points[:, 2] = 0.5 + 0.2 * np.sin(20 * points[:, 0]) * points[:, 1] + rng.normal(0, 2e-4, count)
+    elif kind == "stray":  # boxes of the search grow far too large
+        points[:: max(2, count // 3)] += [30.0, -20.0, 100.0]
+    elif kind == "repeated":  # more points at one place than neighbours
+        points = points[rng.integers(0, max(1, count // 20), count)] + rng.integers(0, 2, (count, 3)) * 1e-4
+    return points.astype(np.float32)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
+@given(st.sampled_from(["uniform", "sheet", "stray"]), st.integers(0, 1000), st.integers(3, 400), st.integers(3, 40))
+def test_the_c_code_equals_its_reference(kind: str, seed: int, count: int, neighbors: int) -> None:
+    assert native.load("attentionvote.geometry", "normals.c") is not None
+    points = clouds(kind, seed, count)
+    query = np.concatenate([points[: count // 2], clouds("uniform", seed + 1, 20)])
+    actual = estimate_normals(points, query, neighbors).astype(np.float64)
+    expected = estimate_normals_reference(points, query, min(neighbors, count)).astype(np.float64)
+    # Two directions of equal variance have no answer: what counts is the variance along the normal.
+    apart = np.linalg.norm(np.cross(actual, expected), axis=1)
+    for q in np.flatnonzero(apart > 2e-4):
+        variance = np.sort(variances(points, query[q], neighbors))
+        assert variance[1] - variance[0] < 1e-5 * variance[2]
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e15, 3e38])
+def test_clouds_of_any_size_have_normals(size: float) -> None:
+    points = (clouds("sheet", 0, 100).astype(np.float64) * size).astype(np.float32)
+    points[::7] = size * 2e-7
+    normals = estimate_normals(points, None, 10)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+
+
+def variances(points: np.ndarray, query: np.ndarray, neighbors: int) -> np.ndarray:
+    """Of the nearest points, along their principal directions; of equally far points those with the lowest index."""
+    squared = ((points.astype(np.float64) - query.astype(np.float64)) ** 2).sum(1)
+    near = points[np.argsort(squared, kind="stable")[:neighbors]].astype(np.float64)
+    near -= near.mean(0)
+    return np.linalg.eigvalsh(near.T @ near)
+
+
+@given(st.integers(0, 1000), st.integers(30, 600))
+def test_of_equally_far_points_the_first_are_taken(seed: int, count: int) -> None:
+    lattice = (np.random.default_rng(seed).integers(0, 6, (count, 3)) * 0.0078125 + [0, 0, 0.5]).astype(np.float32)
+    for points in (lattice, clouds("repeated", seed, count)):
+        normals = estimate_normals(points, points[:20], 20).astype(np.float64)
+        for normal, query in zip(normals, points[:20], strict=True):
+            squared = ((points.astype(np.float64) - query) ** 2).sum(1)
+            near = points[np.argsort(squared, kind="stable")[:20]].astype(np.float64)
+            along = (((near - near.mean(0)) @ normal) ** 2).sum()
+            smallest = variances(points, query, 20)
+            assert abs(along - smallest[0]) <= 1e-6 * smallest[2] + 1e-15
+        assert ((normals * points[:20]).sum(1) <= 1e-7).all()
 
 
 def test_normals_of_a_sphere_are_its_radii_and_look_at_the_camera() -> None:

@@ -41,7 +41,7 @@ def test_inputs_are_points_of_the_cloud_with_the_dense_clouds_normals(
     assert prepared.points.flags.c_contiguous
     assert len(rows(prepared.points)) == 256
     assert rows(prepared.points) <= rows(cloud)
-    np.testing.assert_array_equal(prepared.normals[0], estimate_normals(cloud, prepared.points[0], 30))
+    np.testing.assert_allclose(prepared.normals[0], estimate_normals(cloud, prepared.points[0], 30), atol=1e-5)
     assert (prepared.given, prepared.used, prepared.warnings) == (3000, 3000, ())
 
 

@@ -40,7 +40,7 @@ def disabled() -> Iterator[None]:
         _disabled = before
 
 
-def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
+def load(package: str, file: str, tuned: bool = False, make: bool = True) -> ctypes.CDLL | None:
     """The compiled library of a C file that lies in a package, or None (with one warning) without a C compiler or
     a place to keep it.
 
@@ -48,21 +48,20 @@ def load(package: str, file: str, tuned: bool = False) -> ctypes.CDLL | None:
         package: dotted name of the package.
         file: name of the C file in it.
         tuned: compile for exactly this processor; results may differ in the last bit between machines.
+        make: whether it is compiled when it is not there; without, nothing is written and nothing is said.
 
     Raises:
         OSError: when the compiler refuses the file, with the compiler's words.
     """
-    return None if _disabled else compiled(package, file, tuned)
+    if _disabled or not (make or _library(package, file, tuned)[0].exists()):
+        return None
+    return compiled(package, file, tuned)
 
 
 @functools.cache
 def compiled(package: str, file: str, tuned: bool) -> ctypes.CDLL | None:
     """What ``load`` returns, once per process and file."""
-    flags = (*PORTABLE, "-march=native") if tuned else PORTABLE
-    source = resources.files(package).joinpath(file).read_bytes()
-    machine = _processor() if tuned else platform.machine()
-    key = hashlib.sha256("\0".join([source.decode(), *flags, machine]).encode()).hexdigest()
-    path = cache_folder() / f"{Path(file).stem}-{key[:16]}.so"
+    path, flags, source = _library(package, file, tuned)
     if not path.exists():
         if not _writable(path.parent):
             warnings.warn(
@@ -76,6 +75,15 @@ def compiled(package: str, file: str, tuned: bool) -> ctypes.CDLL | None:
             return None
         _compile(compiler, flags, source, path)
     return ctypes.CDLL(str(path))
+
+
+def _library(package: str, file: str, tuned: bool) -> tuple[Path, tuple[str, ...], bytes]:
+    """Where a C file's library is kept, how it is compiled, and its source."""
+    flags = (*PORTABLE, "-march=native") if tuned else PORTABLE
+    source = resources.files(package).joinpath(file).read_bytes()
+    machine = _processor() if tuned else platform.machine()
+    key = hashlib.sha256("\0".join([source.decode(), *flags, machine]).encode()).hexdigest()
+    return cache_folder() / f"{Path(file).stem}-{key[:16]}.so", flags, source
 
 
 def call(function: ctypes._NamedFuncPointer, *arguments: object) -> None:

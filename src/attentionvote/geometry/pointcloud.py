@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from attentionvote.geometry import native
+
 NORMAL_NEIGHBORS = 30
 
 
@@ -40,7 +42,10 @@ def back_project(
 
 
 def estimate_normals(
-    points: NDArray[np.float32], query: NDArray[np.float32] | None = None, neighbors: int = NORMAL_NEIGHBORS
+    points: NDArray[np.float32],
+    query: NDArray[np.float32] | None = None,
+    neighbors: int = NORMAL_NEIGHBORS,
+    make: bool = True,
 ) -> NDArray[np.float32]:
     """Unit normals ``(Q, 3)`` by principal component analysis, turned towards the camera at the origin.
 
@@ -52,6 +57,8 @@ def estimate_normals(
         points: ``(P, 3)`` metres, camera frame, the densest cloud at hand.
         query: ``(Q, 3)`` where normals are wanted; all points when None.
         neighbors: size of the neighbourhood; all points when there are fewer.
+        make: whether the C code may be compiled now. A cell never does that: it has what its image brings, or takes the
+            reference.
 
     Raises:
         ValueError: when there are fewer than three points or any is not finite.
@@ -66,8 +73,25 @@ def estimate_normals(
             )
     if len(points) < 3:
         raise ValueError(f"normals need at least 3 points, got {len(points)}")
+    libraries = [native.load("attentionvote.geometry", file, make=make) for file in ("pointops.c", "normals.c")]
+    nearest = min(neighbors, len(points))
+    if libraries[0] is None or libraries[1] is None:
+        return estimate_normals_reference(points, asked, nearest)
+    order, turn = (np.empty(len(a), dtype=np.int32) for a in (points, asked))
+    clouds = [np.ascontiguousarray(a, dtype=np.float32) for a in (points, asked)]
+    for cloud, found in zip(clouds, (order, turn), strict=True):
+        native.call(libraries[0].morton_order, cloud, len(cloud), found)
+    normals = np.empty_like(clouds[1])
+    native.call(libraries[1].normals, clouds[0], order, len(points), clouds[1], turn, len(asked), nearest, normals)
+    return normals
+
+
+def estimate_normals_reference(
+    points: NDArray[np.float32], asked: NDArray[np.float32], neighbors: int
+) -> NDArray[np.float32]:
+    """``estimate_normals`` of checked arguments with scipy's kd-tree and LAPACK; ``neighbors`` at most all points."""
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False, leafsize=32)
-    _, index = tree.query(asked, k=min(neighbors, len(points)))
+    index = tree.query(asked, k=range(1, neighbors + 1))[1]
     near = points.astype(np.float64)[index]
     near -= near.mean(axis=1, keepdims=True)
     covariance = np.einsum("qki,qkj->qij", near, near, optimize=True)

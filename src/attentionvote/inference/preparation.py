@@ -154,7 +154,7 @@ def prepare(
     dense = cloud if len(cloud) <= card.density else cloud[sample_indices(len(cloud), card.density, rng)]
     chosen = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])
     between()
-    normals = estimate_normals(dense, chosen, card.normal_neighbors)
+    normals = estimate_normals(dense, chosen, card.normal_neighbors, make=False)
     return Prepared(chosen[None], normals[None], given, len(cloud), warnings)
 
 
