@@ -197,21 +197,25 @@ class PartCaster:
         last = np.floor((high * focal + centre) / stride).astype(int)
         origin = np.minimum(first.min(axis=0), 0)
         buffer_size = np.maximum(last.max(axis=0), (size - 1) // stride) - origin + 1
-        nearest = np.full(buffer_size[::-1], np.inf)
+        nearest = np.full(buffer_size[::-1], np.inf, dtype=np.float32)
         owner = np.full(buffer_size[::-1], -1, dtype=np.int32)
         silhouette = np.zeros(count)
         for i, pose in enumerate(camera_from_part):
-            v, u = np.mgrid[first[i, 1] : last[i, 1] + 1, first[i, 0] : last[i, 0] + 1]
-            pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-            rays = np.ones((len(pixels), 3), dtype=np.float32)
-            rays[:, :2] = camera.rays(pixels * stride)
-            t, face = self._cast_one(kinds[i], pose, rays)
-            hit = face >= 0
-            silhouette[i] = hit.sum()
-            row, column = (pixels[hit] - origin).T[::-1]
-            closer = t[hit] < nearest[row, column]
-            nearest[row[closer], column[closer]] = t[hit][closer]
-            owner[row[closer], column[closer]] = i
+            (u, v), (width, height) = first[i], last[i] - first[i] + 1
+            if min(width, height) < 1:
+                continue
+            # A ray's x is its column's, its y its row's.
+            rays = np.ones((height, width, 3), dtype=np.float32)
+            rays[..., 0] = (np.arange(u, u + width) * stride - centre[0]) / focal[0]
+            rays[..., 1] = ((np.arange(v, v + height) * stride - centre[1]) / focal[1])[:, None]
+            t, face = self._cast_one(kinds[i], pose, rays.reshape(-1, 3))
+            t[face < 0] = np.inf
+            silhouette[i] = (face >= 0).sum()
+            (column, row), depth = (u, v) - origin, t.reshape(height, width)
+            window = slice(row, row + height), slice(column, column + width)
+            closer = depth < nearest[window]
+            np.copyto(nearest[window], depth, where=closer)
+            owner[window][closer] = i
         row, column = np.nonzero(owner >= 0)
         pixels = (np.stack([column, row], axis=1) + origin) * stride
         seen = ((pixels >= 0) & (pixels < size)).all(axis=1)
