@@ -14,6 +14,8 @@
 #define BLOCK 64
 #define MAX_CELLS_PER_AXIS 1024
 #define DIGIT 11 /* bits a pass of the sort */
+#define FEW 24   /* numbers that are sorted by insertion */
+#define CHUNK 64 /* distances at a time */
 
 typedef struct {
     uint32_t key;
@@ -135,28 +137,25 @@ int farthest_point_order(const float *xyz, int32_t n, int32_t m, int32_t *order)
     return 0;
 }
 
-static int ascending(const void *a, const void *b) {
-    const int32_t x = *(const int32_t *)a, y = *(const int32_t *)b;
-    return x < y ? -1 : (x > y);
-}
-
-static void keep_smallest(int32_t *v, int32_t n, int32_t k) { /* quickselect: the k smallest come first */
-    int32_t lo = 0, hi = n - 1;
-    while (lo < hi) {
-        const int32_t pivot = v[lo + (hi - lo) / 2];
-        int32_t i = lo, j = hi;
-        while (i <= j) {
-            while (v[i] < pivot) i++;
-            while (v[j] > pivot) j--;
-            if (i <= j) {
-                const int32_t t = v[i];
-                v[i++] = v[j], v[j--] = t;
-            }
+/* The k smallest of n different numbers below 64 * words, in order. Few are sorted by insertion; of many the bits of a
+ * set, which is empty before and after, are read off until k are found. Returns how many there are, at most k. */
+static int32_t smallest_in_order(int32_t *v, int32_t n, int32_t k, uint64_t *set, int32_t words) {
+    if (n <= FEW) {
+        for (int32_t i = 1; i < n; i++) {
+            const int32_t own = v[i];
+            int32_t j = i;
+            for (; j > 0 && v[j - 1] > own; j--) v[j] = v[j - 1];
+            v[j] = own;
         }
-        if (k - 1 <= j) hi = j;
-        else if (k - 1 >= i) lo = i;
-        else return;
+        return n < k ? n : k;
     }
+    for (int32_t i = 0; i < n; i++) set[v[i] >> 6] |= (uint64_t)1 << (v[i] & 63);
+    int32_t count = 0;
+    for (int32_t w = 0; w < words && count < k; w++)
+        for (uint64_t bits = set[w]; bits && count < k; bits &= bits - 1)
+            v[count++] = 64 * w + __builtin_ctzll(bits);
+    memset(set, 0, sizeof(uint64_t) * (size_t)words);
+    return count;
 }
 
 /* For every centre the first k points in index order with distance <= radius, padded with the first; counts[c]
@@ -188,12 +187,15 @@ int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, flo
     int32_t *start = calloc((size_t)total + 2, sizeof(int32_t));
     int32_t *cell_of = malloc(sizeof(int32_t) * ((size_t)n + 1));
     int32_t *sorted = malloc(sizeof(int32_t) * ((size_t)n + 1));
-    float *packed = malloc(sizeof(float) * 3 * ((size_t)n + 1));
+    const int32_t words = n / 64 + 1;
+    float *soa = malloc(sizeof(float) * 3 * ((size_t)n + 1));
     int32_t *found = malloc(sizeof(int32_t) * ((size_t)n + 1));
-    if (!start || !cell_of || !sorted || !packed || !found) {
-        free(start), free(cell_of), free(sorted), free(packed), free(found);
+    uint64_t *set = calloc((size_t)words, sizeof(uint64_t));
+    if (!start || !cell_of || !sorted || !soa || !found || !set) {
+        free(start), free(cell_of), free(sorted), free(soa), free(found), free(set);
         return 1;
     }
+    float *x = soa, *y = soa + n, *z = soa + 2 * (size_t)n; /* by cell */
     for (int32_t i = 0; i < n; i++) {
         int64_t c[3];
         for (int a = 0; a < 3; a++) {
@@ -207,7 +209,7 @@ int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, flo
     for (int32_t i = 0; i < n; i++) {
         const int32_t slot = start[cell_of[i] + 1]++;
         sorted[slot] = i;
-        for (int a = 0; a < 3; a++) packed[3 * slot + a] = xyz[3 * i + a];
+        x[slot] = xyz[3 * i], y[slot] = xyz[3 * i + 1], z[slot] = xyz[3 * i + 2];
     }
     const float squared = radius * radius;
     for (int32_t q = 0; q < m; q++) {
@@ -226,19 +228,24 @@ int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, flo
                 if (from[0] > to[0]) continue;
                 const int64_t row = (cz * cells[1] + cy) * cells[0];
                 const int32_t end = start[row + to[0] + 1];
-                for (int32_t s = start[row + from[0]]; s < end; s++) {
-                    const float dx = packed[3 * s] - p[0], dy = packed[3 * s + 1] - p[1], dz = packed[3 * s + 2] - p[2];
-                    found[count] = sorted[s];
-                    count += dx * dx + dy * dy + dz * dz <= squared;
+                for (int32_t s = start[row + from[0]]; s < end; s += CHUNK) {
+                    const int32_t size = end - s < CHUNK ? end - s : CHUNK;
+                    float distance[CHUNK];
+                    for (int32_t i = 0; i < size; i++) {
+                        const float dx = x[s + i] - p[0], dy = y[s + i] - p[1], dz = z[s + i] - p[2];
+                        distance[i] = dx * dx + dy * dy + dz * dz;
+                    }
+                    for (int32_t i = 0; i < size; i++) {
+                        found[count] = sorted[s + i];
+                        count += distance[i] <= squared;
+                    }
                 }
             }
         int32_t *out = neighbors + (int64_t)q * k;
-        if (count > k) keep_smallest(found, count, k);
-        counts[q] = count < k ? count : k;
-        qsort(found, (size_t)counts[q], sizeof(int32_t), ascending);
+        counts[q] = smallest_in_order(found, count, k, set, words);
         for (int32_t j = 0; j < k; j++) out[j] = counts[q] == 0 ? 0 : found[j < counts[q] ? j : 0];
     }
-    free(start), free(cell_of), free(sorted), free(packed), free(found);
+    free(start), free(cell_of), free(sorted), free(soa), free(found), free(set);
     return 0;
 }
 
