@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -92,6 +93,17 @@ def test_what_is_impossible_gets_one_sentence(conf: Path, words: str, expected: 
     with pytest.raises(ConfigurationError) as raised:
         compose("fake", words.split(), conf)
     assert sentence(raised.value) == expected
+
+
+def test_a_file_that_changes_between_two_calls_counts(conf: Path, tmp_path: Path) -> None:
+    own = tmp_path / "conf"
+    shutil.copytree(conf, own)
+    words = ["object=gear", "trainer.lr=0.1"]
+    assert compose("fake", words, own).trainer.lr == 0.1
+    trainer = own / "trainer" / "default.yaml"
+    trainer.write_text(trainer.read_text(encoding="utf-8").replace("lr:", "rate:"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"there is no setting 'trainer\.lr'"):
+        compose("fake", words, own)
 
 
 def test_a_broken_file_is_named(conf: Path) -> None:
