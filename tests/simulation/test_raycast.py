@@ -57,6 +57,15 @@ def test_normals_are_unit_vectors_towards_the_camera(caster: PartCaster, heap: H
     assert (np.einsum("pi,pi->p", hits.normal[hit], with_z(xy[hit])) <= 0).all()
 
 
+def test_without_normals_the_rest_is_the_same(caster: PartCaster, heap: Heap) -> None:
+    xy = random_rays(4000, seed=2)
+    with_them, without = (caster.cast(heap(8), xy, normals=asked) for asked in (True, False))
+    np.testing.assert_array_equal(with_them.depth, without.depth)
+    np.testing.assert_array_equal(with_them.instance, without.instance)
+    assert (without.normal == 0).all()
+    assert (with_them.normal != 0).any()
+
+
 def test_an_open_surface_turns_its_normals_too(bracket: Part, heap: Heap) -> None:
     inside_out = Part("inside_out", bracket.vertices, bracket.faces[:, ::-1], bracket.diameter)
     xy = random_rays(500, seed=2)

@@ -44,7 +44,7 @@ def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cac
         raise ValueError(f"hull threshold must lie in 0.01..1 (coacd's range), got {threshold}")
     if not 8 <= max_vertices <= 256:
         raise ValueError(f"hull vertices must lie in 8..256, got {max_vertices}")
-    path = (cache or cache_directory()) / "hulls" / f"{_cache_key(part, threshold, max_vertices)}.npz"
+    path = hull_file(part, threshold, max_vertices, cache or cache_directory())
     if path.is_file():
         with np.load(path) as stored:
             return tuple(stored[f"hull_{i:03d}"] for i in range(len(stored.files)))
@@ -58,10 +58,11 @@ def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cac
     return hulls
 
 
-def _cache_key(part: Part, threshold: float, max_vertices: int) -> str:
+def hull_file(part: Part, threshold: float, max_vertices: int, cache: Path) -> Path:
+    """Where a cache keeps the pieces of a part: ``hull_000`` and so on in an ``.npz`` file."""
     h = hashlib.sha256(np.round(part.vertices * 1e9).astype(np.int64).tobytes() + part.faces.tobytes())
     h.update(repr((threshold, max_vertices, version("coacd"))).encode())
-    return h.hexdigest()[:32]
+    return cache / "hulls" / f"{h.hexdigest()[:32]}.npz"
 
 
 def _decompose(part: Part, threshold: float, max_vertices: int) -> Hulls:

@@ -112,6 +112,7 @@ class PartCaster:
         surface: BinSurface | None = None,
         part_ids: NDArray[np.int32] | None = None,
         background: bool = True,
+        normals: bool = True,
     ) -> Hits:
         """First hits of rays from the origin through ``xy`` ``(P, 2)`` on the plane z = 1.
 
@@ -121,6 +122,7 @@ class PartCaster:
             surface: the bin, or None for none.
             part_ids: ``(I,)`` which part each instance is.
             background: also compute the bin's depth along rays that meet no instance; inf there otherwise.
+            normals: also compute the normals; all zero otherwise.
 
         Raises:
             ValueError: when an instance reaches behind the origin.
@@ -155,6 +157,8 @@ class PartCaster:
             front = t < wall[ray] + self._sunk[kinds[owner]]
             ray, t, owner, face = ray[front], t[front], owner[front], face[front]
         depth[ray], instance[ray] = t, owner
+        if not normals:
+            return Hits(depth, instance, normal)
         turned = np.einsum(
             "pij,pj->pi", camera_from_part[owner, :3, :3], self._normals[self._first_face[kinds[owner]] + face]
         )
@@ -172,7 +176,8 @@ class PartCaster:
         part_ids: NDArray[np.int32] | None = None,
     ) -> NDArray:
         """``(P,)`` bool: the ray to ``points`` ``(P, 3)`` ends more than ``margin`` metres before them."""
-        depth = self.cast(camera_from_part, points[:, :2] / points[:, 2:], surface, part_ids).depth
+        xy = points[:, :2] / points[:, 2:]
+        depth = self.cast(camera_from_part, xy, surface, part_ids, normals=False).depth
         return depth < points[:, 2] - margin
 
     def visible_fraction(

@@ -113,13 +113,14 @@ def synthesize(
         chosen = order[used : used + batch]
         used += len(chosen)
         pixels = np.stack([chosen % width + u0, chosen // width + v0], axis=1)
-        hits = caster.cast(poses, record.camera.rays(pixels), surface, record.part_ids, background=False)
+        rays, incidence = record.camera.rays(pixels), scanner is not None
+        hits = caster.cast(poses, rays, surface, record.part_ids, background=False, normals=incidence)
         if scanner is not None:
             new_points, new_ids = scanner.measure(pixels, hits)
         else:
             foreground = hits.instance >= 0
-            rays = record.camera.rays(pixels[foreground])
-            new_points = np.c_[rays, np.ones(len(rays))] * hits.depth[foreground, None]
+            seen = rays[foreground]
+            new_points = np.c_[seen, np.ones(len(seen))] * hits.depth[foreground, None]
             new_ids = hits.instance[foreground]
         points.append(new_points)
         ids.append(new_ids)
@@ -195,7 +196,7 @@ class _Scanner:
         neighbours = (pixels[:, None] + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
         rays = self.record.camera.rays(neighbours)
         record = self.record
-        hits = self.caster.cast(record.camera_from_part, rays, record.bin_surface, record.part_ids)
+        hits = self.caster.cast(record.camera_from_part, rays, record.bin_surface, record.part_ids, normals=False)
         depth = hits.depth.reshape(-1, 4)
         jump = np.abs(depth - z[:, None])
         edge = jump.max(axis=1, initial=0) > self.sensor.edge_jump * self.scale
