@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import train
+from configuration import compose
 
 from attentionvote import tracking
 from attentionvote.tracking.server import free_port
@@ -138,18 +140,16 @@ def test_without_the_right_password_connect_says_so_at_once(server, as_user, cap
     assert "not-the-password" not in str(caught.value) + caplog.text
 
 
-def test_a_verb_says_one_sentence_before_its_work(server, as_user, repository, tmp_path):
+@pytest.mark.usefixtures("quick_training")
+def test_a_verb_says_one_sentence_before_its_work(server, as_user, tmp_path, caplog):
     as_user("admin", "not-the-password")
     settings = [f"tracking.store={server.url}", f"root={tmp_path}/data", f"outputs={tmp_path}/outputs"]
-    words = ["pipelines/train.py", "object=connecting_rod", "experiment=smoke", *settings]
-    done = subprocess.run([sys.executable, *words], cwd=repository, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stdout == ""
-    sentence = done.stderr.strip().splitlines()[-1]
-    assert sentence.startswith(f"train: tracking server {server.url} must be given user and password")
-    assert "not-the-password" not in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list((tmp_path / "data").rglob("*.npz"))
+    with pytest.raises(ConnectionError) as caught:
+        train.run(compose("train", ["object=connecting_rod", "experiment=smoke", *settings]))
+    sentence = str(caught.value)
+    assert sentence.startswith(f"tracking server {server.url} must be given user and password")
+    assert "not-the-password" not in sentence + caplog.text
+    assert "\n" not in sentence
     assert not [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
 
 
