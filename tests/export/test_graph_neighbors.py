@@ -48,12 +48,16 @@ def cloud(kind: str) -> NDArray[np.float32]:
         points = points * [10, 10, 1]
     elif kind == "stray":  # a few points on a wall ten metres behind
         points[::97] += [3.0, -2.0, 10.0]
+    elif kind == "edges":  # half of the points lie on the edge of another one's ball, but for rounding
+        direction = rng.normal(size=(COUNT // 2, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        points[COUNT // 2 :] = points[: COUNT // 2].astype(np.float32) + LAYOUT.radii[0] * direction
     elif kind == "one place":
         points = np.full((COUNT, 3), 0.5)
     return points.astype(np.float32)
 
 
-@pytest.mark.parametrize("kind", ["uniform", "lattice", "repeated", "sparse", "stray", "one place"])
+@pytest.mark.parametrize("kind", ["uniform", "lattice", "repeated", "sparse", "stray", "edges", "one place"])
 def test_the_graph_finds_what_the_operators_find(finder: onnxruntime.InferenceSession, kind: str) -> None:
     points = cloud(kind)
     order, *rest = (a[0] for a in finder.run(None, {"points": points[None]}))

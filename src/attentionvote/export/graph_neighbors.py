@@ -6,8 +6,9 @@ Written for the exporter: loops are ``scan`` (an ONNX Scan), shapes are static, 
 
 Formulations (measured in this project's speed notes and again in ``tests/export``): the running minimum of the
 farthest-point pass is searched in two steps, rows first, since ArgMax over one long row is slow; "the first k in index
-order" is TopK over ``relu(d^2 - r^2)`` of which every point inside is an equal 0, and the ONNX specification breaks
-ties by the lower index. ``torch.topk`` does not promise that: these functions are for export, not for eager use.
+order" is TopK over numbers of which every point inside is an equal 0 and every other one a 1, and the ONNX specification
+breaks ties by the lower index (``relu(d^2 - r^2)`` does the same in twice the time: TopK then meets something smaller
+than what it keeps again and again; two steps, over blocks and over the points of those chosen, gain nothing). ``torch.topk`` does not promise that: these functions are for export, not for eager use.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from attentionvote.model import Layout, Neighborhoods
 _ROW = 256  # points a row of the two-step ArgMax
 ERROR = 2e-6  # of the matrix product, relative to the squared distances it is made of; float32 has 6e-8 an operation
 SPARE = 8  # candidates beyond those wanted: more than ever lie on the edge of a ball
+STEEP = 2.0**60  # outside a ball everything is 1: TopK keeps what it has when nothing smaller comes, most of the time
 CHUNK = 16  # centres a step: their distances stay in the cache
 
 
@@ -62,14 +64,14 @@ def ball_query(
     most, candidates = min(count, len(points)), min(count + SPARE, len(points))
     middle = points.mean(0)
     p, c = points - middle, centers - middle
-    far = p.square().sum(-1) * (1 - ERROR)
-    columns = torch.stack([*p.unbind(-1), torch.ones(len(points)), far - radius * radius])
-    rows = torch.cat([-2 * c, c.square().sum(-1, keepdim=True) * (1 - ERROR), torch.ones(len(centers), 1)], dim=-1)
+    far = _a_little_less(p.square().sum(-1))
+    columns = torch.stack([*p.unbind(-1), torch.ones(len(points)), far - radius * radius]) * STEEP
+    rows = torch.cat([-2 * c, _a_little_less(c.square().sum(-1, keepdim=True)), torch.ones(len(centers), 1)], dim=-1)
     limit = torch.tensor(radius, dtype=torch.float32).square()
 
     def step(carry: Tensor, block: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         row, center = block
-        near = torch.topk(torch.relu(row @ columns), candidates, dim=1, largest=False, sorted=True)[1]
+        near = torch.topk((row @ columns).clamp(0, 1), candidates, dim=1, largest=False, sorted=True)[1]
         dx, dy, dz = (points[near] - center[:, None]).unbind(-1)
         beyond = torch.relu(dx * dx + dy * dy + dz * dz - limit)
         value, place = torch.topk(beyond, most, dim=1, largest=False, sorted=True)
@@ -108,6 +110,11 @@ def find_neighborhoods(points: Float[Tensor, "1 points 3"], layout: Layout) -> N
         tuple(index[None] for index, _ in found),
         tuple(weight[None] for _, weight in found),
     )
+
+
+def _a_little_less(squared: Tensor) -> Tensor:
+    """Less by the error of the matrix product; the exporter deletes a multiplication by 1 - 2e-6."""
+    return squared - squared * ERROR
 
 
 def _planes(points: Tensor) -> list[Tensor]:
