@@ -5,10 +5,11 @@ float32, so that the graph chooses the same points and neighbours and the poses 
 Written for the exporter: loops are ``scan`` (an ONNX Scan), shapes are static, the batch is one.
 
 Formulations (measured in this project's speed notes and again in ``tests/export``): the running minimum of the
-farthest-point pass is searched in two steps, rows first, since ArgMax over one long row is slow; "the first k in index
-order" is TopK over numbers of which every point inside is an equal 0 and every other one a 1, and the ONNX specification
-breaks ties by the lower index (``relu(d^2 - r^2)`` does the same in twice the time: TopK then meets something smaller
-than what it keeps again and again; two steps, over blocks and over the points of those chosen, gain nothing). ``torch.topk`` does not promise that: these functions are for export, not for eager use.
+farthest-point pass is searched in two steps, rows first, since ArgMax over one long row is slow. "The first k in index
+order" is TopK over numbers of which every point inside is an equal 0 and every other one a 1; the ONNX specification
+breaks ties by the lower index. ``relu(d^2 - r^2)`` says the same in twice the time, because TopK then meets something
+smaller than what it keeps again and again; TopK in two steps, over blocks and over the points of those chosen, gains
+nothing. ``torch.topk`` does not promise an order of ties: these functions are for export, not for eager use.
 """
 
 from __future__ import annotations
