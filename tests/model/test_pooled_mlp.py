@@ -23,6 +23,8 @@ SHAPES = [
     (4, 7, 10, (32, 64)),
     (2, 255, 10, (8, 8)),
     (9, 16, 10, (40, 40, 16)),
+    (6, 16, 10, (64, 32, 96, 32)),  # whole tiles where the processor has AVX-512
+    (3, 24, 10, (32, 40, 64, 64)),  # tiles above and below a layer without
     (0, 4, 10, (8, 8)),
 ]
 

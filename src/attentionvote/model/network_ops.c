@@ -48,6 +48,24 @@ static void linear_wide(const float *in, int rows, int n_in, const float *weight
             }
         }
 }
+
+/* sums[n_left][n_right] += transpose(left[rows][n_left]) * right[rows][n_right], in tiles as above. */
+static void outer_wide(const float *left, int n_left, const float *right, int n_right, int rows, float *sums) {
+    for (int i = 0; i < n_left; i += WIDE_ROWS)
+        for (int o = 0; o < n_right; o += WIDE_COLUMNS) {
+            v16 a[WIDE_ROWS], b[WIDE_ROWS];
+            float *y = sums + (int64_t)i * n_right + o;
+            for (int j = 0; j < WIDE_ROWS; j++)
+                a[j] = *(const v16 *)(y + (int64_t)j * n_right), b[j] = *(const v16 *)(y + (int64_t)j * n_right + 16);
+            for (int r = 0; r < rows; r++) {
+                const float *x = left + (int64_t)r * n_left + i, *w = right + (int64_t)r * n_right + o;
+                const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
+                for (int j = 0; j < WIDE_ROWS; j++) a[j] += x[j] * w0, b[j] += x[j] * w1;
+            }
+            for (int j = 0; j < WIDE_ROWS; j++)
+                *(v16 *)(y + (int64_t)j * n_right) = a[j], *(v16 *)(y + (int64_t)j * n_right + 16) = b[j];
+        }
+}
 #endif
 
 /* out[rows][n_out] = in[rows][n_in] * weights[n_in][n_out] + bias, optionally ReLU. */
@@ -107,6 +125,12 @@ static void axpy(float a, const float *x, float *y, int n) {
     for (int i = 0; i < n; i += 8) V(y + i) += a * C(x + i);
 }
 
+/* A gradient behind a ReLU, which is added to the bias's. */
+static void gated(float *gradient, const float *hidden, int n, float *grad_bias) {
+    for (int i = 0; i < n; i++) gradient[i] = hidden[i] > 0.0f ? gradient[i] : 0.0f;
+    for (int i = 0; i < n; i += 8) V(grad_bias + i) += C(gradient + i);
+}
+
 /* Hidden layers of one centre: hidden[l] for l < layers - 1. The first adds the projected features of the level below. */
 static void hidden_layers(const float *geometry, int k, int channels, const float *projected, const int64_t *index,
                           int layers, const int32_t *widths, const float *const *weights, const float *const *biases,
@@ -163,12 +187,15 @@ int pooled_backward(const float *geometry, int64_t from, int64_t to, int32_t k, 
                     float *grad_projected) {
     float *hidden[8], *grads[8];
     const int top = widths[layers - 1], n = layers - 1;
-    size_t total = 0;
-    for (int l = 0; l < n; l++) total += 2 * (size_t)k * widths[l];
-    float *memory = malloc(sizeof(float) * total);
+    size_t total = 0, widest = 0;
+    for (int l = 0; l < n; l++) {
+        total += 2 * (size_t)k * widths[l];
+        widest = (size_t)widths[l] > widest ? (size_t)widths[l] : widest;
+    }
+    float *memory = malloc(sizeof(float) * total), *none = calloc(widest, sizeof(float)); /* no bias */
     uint8_t *touched = malloc((size_t)k);
-    if (!memory || !touched) {
-        free(memory), free(touched);
+    if (!memory || !touched || !none) {
+        free(memory), free(touched), free(none);
         return 1;
     }
     float *next = memory;
@@ -188,14 +215,23 @@ int pooled_backward(const float *geometry, int64_t from, int64_t to, int32_t k, 
             axpy(grad[i], transposed[n] + (int64_t)i * widths[n - 1], grads[n - 1] + w * widths[n - 1], widths[n - 1]);
             grad_biases[n][i] += grad[i];
         }
+        int first = n - 1; /* the highest layer whose gradients still have to be handed down */
+#ifdef __AVX512F__
+        /* All neighbours together; the untouched ones' gradients are zero. */
+        for (; first > 0 && k % WIDE_ROWS == 0 && widths[first - 1] % WIDE_COLUMNS == 0; first--) {
+            const int width = widths[first], under = widths[first - 1];
+            for (int64_t j = 0; j < k; j++)
+                gated(grads[first] + j * width, hidden[first] + j * width, width, grad_biases[first]);
+            outer_wide(grads[first], width, hidden[first - 1], under, k, grad_weights[first]);
+            linear_wide(grads[first], k, width, transposed[first], none, under, grads[first - 1], 0);
+        }
+#endif
         for (int j = 0; j < k; j++) {
             if (!touched[j]) continue;
-            for (int l = n - 1; l >= 0; l--) {
+            for (int l = first; l >= 0; l--) {
                 const int width = widths[l];
                 float *gh = grads[l] + (int64_t)j * width;
-                const float *h = hidden[l] + (int64_t)j * width;
-                for (int i = 0; i < width; i++) gh[i] = h[i] > 0.0f ? gh[i] : 0.0f;
-                for (int i = 0; i < width; i += 8) V(grad_biases[l] + i) += C(gh + i);
+                gated(gh, hidden[l] + (int64_t)j * width, width, grad_biases[l]);
                 if (l == 0) break;
                 const float *below = hidden[l - 1] + (int64_t)j * widths[l - 1];
                 float *gb = grads[l - 1] + (int64_t)j * widths[l - 1];
@@ -212,7 +248,7 @@ int pooled_backward(const float *geometry, int64_t from, int64_t to, int32_t k, 
             for (int i = 0; i < channels; i++) axpy(g[(int64_t)j * channels + i], gh, grad_weights[0] + (int64_t)i * widths[0], widths[0]);
         }
     }
-    free(memory), free(touched);
+    free(memory), free(touched), free(none);
     return 0;
 }
 
