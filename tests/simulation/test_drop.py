@@ -16,6 +16,7 @@ from attentionvote.part import Part
 from attentionvote.simulation import drop, load_part
 from attentionvote.simulation.decomposition import Hulls, convex_hulls
 from attentionvote.simulation.drop import BinSettings, DropSettings, Solid, drop_parts
+from attentionvote.simulation.mass import mass_properties
 
 BIN = np.array([0.15, 0.12, 0.1])
 
@@ -51,7 +52,7 @@ def test_a_full_bin_ends_the_cycle(bracket: Part, hulls: Hulls) -> None:
     low = np.array([0.08, 0.07, 0.03])
     result = piles(bracket, hulls, 12, bin_size=low)
     assert 0 < len(result) < 12
-    centre = drop._mass_properties(bracket)[1]
+    centre = mass_properties(bracket)[1]
     assert all(apply(p.bin_from_part, centre[None])[..., 2].max() <= low[2] for p in result)
 
 
@@ -92,7 +93,7 @@ def test_an_exploded_pile_ends_the_cycle(
 
 
 def test_physics_settings_reach_the_model(bracket: Part, hulls: Hulls) -> None:
-    mass, _, inertia = properties = drop._mass_properties(bracket)
+    mass, _, inertia = properties = mass_properties(bracket)
     solid, three = Solid(bracket, hulls), np.zeros(3, dtype=np.int32)
     volume = 0.06 * 0.02 * 0.008 + 0.008 * 0.02 * 0.032
     assert mass == pytest.approx(volume * 2700, rel=1e-6)

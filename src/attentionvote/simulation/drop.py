@@ -19,13 +19,13 @@ from scipy.spatial import ConvexHull
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part, Parts
 from attentionvote.simulation.decomposition import Hulls
+from attentionvote.simulation.mass import Mass, mass_properties
 
 # The bin of the IPA-like protocol, for slender parts of 143 mm.
 REFERENCE_DIAMETER = 0.143
 REFERENCE_BIN = (0.360, 0.280, 0.160)
 # Heaps of bulky parts reach the rim when the parts' convex hulls take about half of the bin's volume.
 _LARGEST_FILL = 0.45
-_DENSITY = 2700.0  # kg/m^3; piles do not depend on it, contacts are normalised by mass
 _SMALL_DIAMETER = 0.040  # below it, time step and contact time constant are halved
 
 
@@ -147,7 +147,7 @@ def drop_parts(
         One :class:`Pile` per accepted drop; its number of parts tells which drop it was.
     """
     count = len(part_ids)
-    masses = [_mass_properties(solid.part) for solid in solids]
+    masses = [mass_properties(solid.part) for solid in solids]
     model = _build_model(solids, masses, part_ids, bin_size, friction, settings)
     data = mujoco.MjData(model)
     vertices = [np.concatenate(solid.hulls) for solid in solids]
@@ -215,28 +215,9 @@ def _settle(model: mujoco.MjModel, data: mujoco.MjData, dropped: int, settings: 
             return float(linear)
 
 
-class _Mass(NamedTuple):
-    """Mass in kg, centre ``(3,)`` in metres and inertia ``(3, 3)`` about it in the part frame."""
-
-    mass: float
-    centre: NDArray[np.float64]
-    inertia: NDArray[np.float64]
-
-
-def _mass_properties(part: Part) -> _Mass:
-    """Those of the solid; of its hull if it is not closed."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-    if not mesh.is_watertight or mesh.volume <= 0:
-        mesh = mesh.convex_hull
-    mesh.density = _DENSITY
-    return _Mass(float(mesh.mass), np.array(mesh.center_mass), np.array(mesh.moment_inertia))
-
-
 def _build_model(
     solids: Sequence[Solid],
-    masses: Sequence[_Mass],
+    masses: Sequence[Mass],
     part_ids: NDArray[np.int32],
     bin_size: NDArray[np.float64],
     friction: float,
