@@ -13,6 +13,11 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
 
 
 def main() -> int:
@@ -31,7 +36,7 @@ def main() -> int:
     except SignalException as ended:
         return 130 if ended.sigval == signal.SIGINT else 128 + int(ended.sigval)
     except ChildFailedError as error:
-        rank, first = error.get_first_failure()
+        rank, first = _cause(error.failures)
         if first.exitcode < 0:
             name = signal.Signals(-first.exitcode).name
             print(f"train: process {rank + 1} was ended by {name}", file=sys.stderr)
@@ -44,6 +49,19 @@ def main() -> int:
         print(f"train: torchrun failed: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return 1
     return 0
+
+
+def _cause(failures: Mapping[int, ProcessFailure]) -> tuple[int, ProcessFailure]:
+    """Rank and failure of the process that the others ended after.
+
+    What a signal has ended comes first: when torchrun looks, another process may have ended for want of it already.
+    """
+
+    def order(rank: int) -> tuple[bool, float]:
+        return failures[rank].exitcode >= 0, failures[rank].timestamp
+
+    rank = min(failures, key=order)
+    return rank, failures[rank]
 
 
 def _check_processes(words: list[str]) -> None:

@@ -14,9 +14,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import start_processes
 import train
 from configuration import ConfigurationError, compose
 from tiny_training import TINY_TRAINING
@@ -130,6 +132,14 @@ def test_a_number_of_processes_that_is_none_is_one_sentence(processes: str) -> N
     )
     assert answer.stderr == f"train: PROCESSES must be a whole number of at least 1, got {processes}\n"
     assert (answer.returncode, answer.stdout) == (2, "")
+
+
+@pytest.mark.parametrize(("exit_codes", "cause"), [((1, -9), 1), ((-9, 1), 0), ((1, 2), 0), ((-9, -11), 0)])
+def test_what_a_signal_ended_is_the_cause_whoever_is_seen_first(exit_codes: tuple[int, ...], cause: int) -> None:
+    """As torchrun finds them: one after the other, in the order of their ranks."""
+    failures = {rank: SimpleNamespace(exitcode=code, timestamp=100.0 + rank) for rank, code in enumerate(exit_codes)}
+    rank, failure = start_processes._cause(failures)  # type: ignore[arg-type]
+    assert (rank, failure.exitcode) == (cause, exit_codes[cause])
 
 
 def test_another_process_only_says_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
