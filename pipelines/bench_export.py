@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from bench_data import slowly
 from bench_material import Material
+from bench_points import cdist_query
 from bench_row import Contest, Unequal
 from bench_rows import EAGER, GRAPH
 from numpy.typing import NDArray
@@ -20,13 +21,13 @@ from attentionvote.inference.preparation import prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.model import Predictions
 
-KERNELS = "torch with C kernels"
+KERNELS, GIVEN = "torch with C kernels", "plain torch, neighbours given"
 MOST_MM = 0.01
 LEAST_SHARE = 0.95  # of proposals: one on the edge of a box or a ball may change sides, as make export reports
 
 
 def graph(material: Material, size: str) -> Contest:
-    """Neighbours found in the graph; plain torch is given them, torch with C kernels finds them."""
+    """Order and neighbours found in the graph and by torch with C kernels; plain torch is given one or both."""
     model, batch = material.network(size), material.batch(size, 1)
     session = Session(material.graph(size), material.card(size))
     points, normals = batch.points.numpy(), batch.normals.numpy()
@@ -38,6 +39,17 @@ def graph(material: Material, size: str) -> Contest:
             return answer
 
         return run
+
+    def finding() -> Predictions:
+        points, layout = batch.points[0], model.layout
+        below, neighbors = points, []
+        for size, count, radius in zip(layout.centers, layout.neighbors, layout.radii, strict=True):
+            centers = points[batch.found.order[0, :size]]
+            neighbors.append(cdist_query(below, centers, radius, count)[None])
+            below = centers
+        with torch.no_grad():
+            answer: Predictions = model(batch.points, batch.normals, batch.found._replace(neighbors=tuple(neighbors)))
+        return answer
 
     def compare(fast: dict[str, NDArray], others: Mapping[str, Predictions]) -> str:
         texts = []
@@ -51,7 +63,7 @@ def graph(material: Material, size: str) -> Contest:
         return f"{min(texts):.0%} of the proposals within {MOST_MM} mm"
 
     text = f"{points.shape[1]:,} points"
-    references = {EAGER: slowly(eager(True)), KERNELS: eager(False)}
+    references = {EAGER: slowly(finding), GIVEN: slowly(eager(True)), KERNELS: eager(False)}
     return Contest(lambda: session.run(points, normals), references, compare, text)
 
 

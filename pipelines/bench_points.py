@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bench_material import Material
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry import sampling, sampling_reference
 from attentionvote.geometry.pointcloud import estimate_normals, estimate_normals_reference
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MOST_DEGREES = 0.01  # between normals of two estimators
 
@@ -79,18 +82,22 @@ def ball_queries(material: Material) -> Contest:
         return [sampling_reference.ball_query(p, ordered[:size], r, k)[0] for p, size, r, k in levels]
 
     def cdist() -> list[NDArray]:
-        found = []
-        for points, size, radius, k in levels:
-            p, c = torch.from_numpy(points), torch.from_numpy(ordered[:size])
-            # By differences: the matrix product's rounding would move points across the edge.
-            inside = torch.cdist(c, p, compute_mode="donot_use_mm_for_euclid_dist") <= radius
-            index = torch.arange(len(p), dtype=torch.int32).expand(size, -1).masked_fill(~inside, len(p))
-            index = torch.topk(index, k, largest=False, sorted=True)[0]
-            found.append(torch.where(index == len(p), index[:, :1], index).long().numpy())
-        return found
+        tensors = [(torch.from_numpy(p), torch.from_numpy(ordered[:size]), r, k) for p, size, r, k in levels]
+        return [cdist_query(*level).numpy() for level in tensors]
 
     size = f"{len(cloud):,} points, {' / '.join(f'{c:,} x {k}' for _, c, _, k in levels)}"
     return Contest(fast, {CDIST: cdist, "numpy": numpy}, identical, size)
+
+
+def cdist_query(points: Tensor, centers: Tensor, radius: float, count: int) -> Tensor:
+    """The first ``count`` points ``(P, 3)`` in each ball, ``(C, count)``, from distances of all pairs in torch."""
+    import torch
+
+    # By differences: the matrix product's rounding would move points across the edge.
+    inside = torch.cdist(centers, points, compute_mode="donot_use_mm_for_euclid_dist") <= radius
+    index = torch.arange(len(points), dtype=torch.int32).expand(len(centers), -1).masked_fill(~inside, len(points))
+    index = torch.topk(index, count, largest=False, sorted=True)[0]
+    return torch.where(index == len(points), index[:, :1], index).long()
 
 
 def normals(material: Material) -> Contest:
