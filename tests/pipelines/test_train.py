@@ -24,12 +24,9 @@ import pytest
 import torch
 import train
 from configuration import ConfigurationError, compose
-from scipy.spatial import ConvexHull
 from tiny_training import TINY_TRAINING
 
 from attentionvote import tracking
-from attentionvote.part import Part
-from attentionvote.simulation import scene_set
 from attentionvote.tracking import figures, scene_pictures
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,10 +37,6 @@ TINY = [
 
 
 CHEAP = pytest.mark.usefixtures("cheap_figures")
-
-
-def one_hull(part: Part, *_: object) -> tuple:
-    return (part.vertices[ConvexHull(part.vertices).vertices],)
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +69,7 @@ def cheap_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
+def alone() -> Iterator[None]:
     threads, level = torch.get_num_threads(), logging.getLogger("lightning.pytorch").level
     yield
     torch.set_num_threads(threads)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import fleet_board
 import pytest
-import torch
 import train
 from configuration import ConfigurationError, compose
 from dataset_scenes import DatasetScenes
@@ -23,13 +22,13 @@ from written_piles import pile_records, write_piles
 from attentionvote.data import Clouds, CloudSettings
 from attentionvote.part import Part
 from attentionvote.simulation import Sensor, load_part
-from attentionvote.tracking import figures, scene_pictures
 from attentionvote.training.checkpoint import load_trained
 
 TINY = [
     "object=brick", *TINY_TRAINING, "workers=1", "force=false", "trainer.batch_size=2", "trainer.max_epochs=2",
     "trainer.average_decay=0.0",
 ]  # fmt: skip
+pytestmark = pytest.mark.usefixtures("quick_training")
 
 
 @pytest.fixture(scope="module")
@@ -58,21 +57,6 @@ def store(put_tables: Callable[[Path], str], tmp_path_factory: pytest.TempPathFa
 @pytest.fixture
 def words(store: str, tmp_path: Path) -> list[str]:
     return [*TINY, f"root={tmp_path}/root", f"outputs={tmp_path}/out", f"tracking.store={store}"]
-
-
-@pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No figure is drawn: each takes a second."""
-    for module, names in (
-        (scene_pictures, ["scene_picture"]),
-        (figures, ["loss_figure", "precision_recall_figure", "ap_threshold_figure"]),
-    ):
-        for name in names:
-            monkeypatch.setattr(module, name, lambda *_, **__: b"picture")
-    threads, level = torch.get_num_threads(), logging.getLogger("lightning.pytorch").level
-    yield
-    torch.set_num_threads(threads)
-    logging.getLogger("lightning.pytorch").setLevel(level)
 
 
 def run(words: list[str], *more: str) -> dict[str, Any]:
