@@ -39,6 +39,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
     with configuring():
         rows, material = chosen(cfg.rows), _material(cfg)
+        earlier = kept_rows(Path(cfg.page)) if cfg.page else {}
     facts = run_facts(cfg.seed, cfg.rounds)
     with material:
         found, failures = measured(rows, material, cfg.rounds)
@@ -47,7 +48,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     show(names, done)
     if cfg.page:
         page = Path(cfg.page)
-        known = {name: row for name, row in kept_rows(page).items() if name not in failures} | done
+        known = {name: row for name, row in earlier.items() if name not in failures} | done
         keep(page, known)
         put(page, SECTION, markdown(names, known), COMMAND)
         log.info("written into %s", page)

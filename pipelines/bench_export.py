@@ -52,15 +52,15 @@ def graph(material: Material, size: str) -> Contest:
         return answer
 
     def compare(fast: dict[str, NDArray], others: Mapping[str, Predictions]) -> str:
-        texts = []
+        shares = []
         for name, other in others.items():
             apart_mm = 1e3 * np.linalg.norm(fast["center"] - other.center.numpy(), axis=-1)
             share = float((apart_mm <= MOST_MM).mean())
             if share < LEAST_SHARE:
                 wanted = f"{LEAST_SHARE:.0%} of the proposals must lie within {MOST_MM} mm"
                 raise Unequal(f"{wanted} of those of {name}, got {share:.0%}")
-            texts.append(share)
-        return f"{min(texts):.0%} of the proposals within {MOST_MM} mm"
+            shares.append(share)
+        return f"{min(shares):.0%} of the proposals within {MOST_MM} mm"
 
     text = f"{points.shape[1]:,} points"
     references = {EAGER: slowly(finding), GIVEN: slowly(eager(True)), KERNELS: eager(False)}

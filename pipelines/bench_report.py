@@ -9,7 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from json_files import read_json, write_json
+from benchmark_page import kept_beside, record_of
+from json_files import write_json
 
 SECTION = "speed"
 COMMAND = "make bench"
@@ -34,19 +35,18 @@ def run_facts(seed: int, rounds: int) -> dict[str, Any]:
     }
 
 
-def record_of(page: Path) -> Path:
-    """Where figures are kept beside a page, so that it shows what earlier calls measured too."""
-    return page.with_suffix("") / f"{SECTION}.json"
-
-
 def kept_rows(page: Path) -> dict[str, dict[str, Any]]:
-    """The rows of earlier calls."""
-    return dict((read_json(record_of(page)) or {}).get("rows", {}))
+    """The rows of earlier calls, which the page goes on to show.
+
+    Raises:
+        ValueError: when their file is damaged.
+    """
+    return dict(kept_beside(page, SECTION, "rows", COMMAND) or {})
 
 
 def keep(page: Path, rows: Rows) -> None:
     """Write the record whole."""
-    write_json(record_of(page), {"rows": dict(rows)})
+    write_json(record_of(page, SECTION), {"rows": dict(rows)})
 
 
 def markdown(names: Sequence[str], rows: Rows) -> str:

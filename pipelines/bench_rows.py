@@ -26,23 +26,16 @@ ROWS: tuple[Row, ...] = (
     Row("normals", "normals of 30 neighbours", "bench_points:normals", (Goal("<= 1.3 x Open3D", 1.3, OPEN3D),)),
     *(
         Row(
-            f"sample-{size}",
-            f"a training sample from stored poses, {size}",
-            "bench_data:new_sample",
-            (Goal("<= 120 ms", 120.0),),
+            f"{kind}-{size}",
+            f"{title}, {size}",
+            prepare,
+            (Goal(f"<= {most} ms", float(most)),),
             "sample",
             arguments=(size,),
         )
-        for size in (COMPACT, FULL)
-    ),
-    *(
-        Row(
-            f"cached-{size}",
-            f"a sample of a later epoch, {size}",
-            "bench_data:cached_sample",
-            (Goal("<= 15 ms", 15.0),),
-            "sample",
-            arguments=(size,),
+        for kind, title, prepare, most in (
+            ("sample", "a training sample from stored poses", "bench_data:new_sample", 120),
+            ("cached", "a sample of a later epoch", "bench_data:cached_sample", 15),
         )
         for size in (COMPACT, FULL)
     ),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmark_table import BenchmarkTable, Curve, mean, title_of
+from json_files import read_json
 from whole_files import whole, write_whole
 
 NOT_RUN = "not run"
@@ -108,6 +109,24 @@ def put(page: Path, name: str, text: str, writer: str = "make benchmark") -> Non
     else:
         new = old.rstrip("\n") + "\n\n" + section
     write_whole(page, new)
+
+
+def record_of(page: Path, name: str) -> Path:
+    """The file beside a page that keeps what a section of it is written from."""
+    return page.with_suffix("") / f"{name}.json"
+
+
+def kept_beside(page: Path, name: str, key: str, writer: str = "make benchmark") -> Any:
+    """What earlier calls kept for a section under a key; None before the first.
+
+    Raises:
+        ValueError: when the file is damaged: the page would lose what it shows.
+    """
+    place = record_of(page, name)
+    kept = (read_json(place) or {}).get(key)
+    if kept is None and place.exists():
+        raise ValueError(f"{place} must be what `{writer}` wrote, got a damaged file: mend or remove it")
+    return kept
 
 
 def draw(table: BenchmarkTable, curve: Curve, cells: Cells, path: Path) -> bool:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from json_files import read_json, write_json
+from benchmark_page import kept_beside, record_of
+from json_files import write_json
 
 
 @dataclass
@@ -33,17 +34,11 @@ class BenchmarkRecord:
         """
         if not page:
             return cls(table, None)
-        place = Path(page).with_suffix("") / f"{table}.json"
-        known = (read_json(place) or {}).get("cells")
-        if known is None:
-            if place.exists():
-                raise ValueError(f"{place} must be what `make benchmark` wrote, got a damaged file: mend or remove it")
-            known = []
-        return cls(table, place, {(cell["row"], cell["object"]): cell for cell in known})
+        cells = kept_beside(Path(page), table, "cells") or []
+        return cls(table, record_of(Path(page), table), {(cell["row"], cell["object"]): cell for cell in cells})
 
     def add(self, row: str, name: str, cell: Mapping[str, Any]) -> None:
         """Keep a cell, in place of what was there."""
         self.cells[row, name] = {"row": row, "object": name, **cell}
         if self.place is not None:
-            self.place.parent.mkdir(parents=True, exist_ok=True)
             write_json(self.place, {"table": self.table, "cells": list(self.cells.values())})

@@ -67,10 +67,9 @@ def _open(
         )
     opened = read_here or SceneSet.open(Path(scenes))
     if opened.digest != digest:
+        shared = f"root={cfg.root} and the dataset" if read_here else f"root={cfg.root}"
         raise ValueError(
             f"{scenes} must hold the same scenes for all processes, but {place.name} on {socket.gethostname()} finds "
-            f"{opened.digest[:12]} instead of {digest[:12]}: share root={cfg.root}"
-            + " and the dataset"
-            * bool(read_here)
+            f"{opened.digest[:12]} instead of {digest[:12]}: share {shared}"
         )
     return Clouds(Path(clouds), opened)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 from bench_report import keep, kept_rows, markdown
 
 
@@ -50,4 +51,7 @@ def test_what_was_measured_is_kept_beside_the_page(tmp_path: Path) -> None:
     assert kept_rows(page) == {}
     keep(page, {"a": {"ms": 1.0}})
     assert kept_rows(page) == {"a": {"ms": 1.0}}
+    (page.with_suffix("") / "speed.json").write_text("{")
+    with pytest.raises(ValueError, match="must be what `make bench` wrote, got a damaged file: mend or remove it"):
+        kept_rows(page)
     assert (tmp_path / "docs" / "page" / "speed.json").is_file()
