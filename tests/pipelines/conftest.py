@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -43,6 +43,14 @@ def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 shutil.copy(library, folder)
             (folder / "new").rename(folder / "hulls")
     return folder
+
+
+@pytest.fixture(scope="module")
+def store(put_tables: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Path of a tracking store of the module's own, with MLflow's tables."""
+    path = tmp_path_factory.mktemp("tracking") / "mlflow.db"
+    put_tables(path)
+    return str(path)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -8,18 +8,11 @@ import generate
 import pytest
 from configuration import ConfigurationError, compose
 from executors import executor_of
-from scipy.spatial import ConvexHull
 from training_job import find_training
 
 from attentionvote.execution import LocalPool, RayCluster, SlurmArray
-from attentionvote.part import Part
-from attentionvote.simulation import scene_set
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]
-
-
-def one_hull(part: Part, *_: object) -> tuple:
-    return (part.vertices[ConvexHull(part.vertices).vertices],)
 
 
 def test_settings_become_an_executor() -> None:
@@ -65,8 +58,7 @@ def test_where_the_jobs_run_is_no_part_of_what_a_training_is() -> None:
 
 
 @pytest.mark.slow
-def test_generate_through_submitted_jobs_is_the_same_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
+def test_generate_through_submitted_jobs_is_the_same_set(tmp_path: Path) -> None:
     one = [*TINY, "splits=[train]"]
     here = generate.run(compose("generate", [*one, f"root={tmp_path / 'here'}", "workers=1"]))
     folder = tmp_path / "slurm"

@@ -9,22 +9,11 @@ import generate
 import numpy as np
 import pytest
 from configuration import ConfigurationError, compose
-from scipy.spatial import ConvexHull
 
 from attentionvote.part import Part
-from attentionvote.simulation import scene_set
 from attentionvote.simulation.scene_set import SceneSet
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]", "workers=1"]
-
-
-def one_hull(part: Part, *_: object) -> tuple:
-    return (part.vertices[ConvexHull(part.vertices).vertices],)
-
-
-@pytest.fixture(autouse=True)
-def quick_hulls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
 
 
 def run(root: Path, *overrides: str) -> dict:

@@ -45,13 +45,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("data")
 
 
-@pytest.fixture(scope="module")
-def store(put_tables: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("tracking") / "mlflow.db"
-    put_tables(path)
-    return str(path)
-
-
 @pytest.fixture
 def words(root: Path, store: str, tmp_path: Path) -> list[str]:
     return [*TINY, f"root={root}", f"outputs={tmp_path / 'out'}", f"tracking.store={store}"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +44,6 @@ def data(brick: Part, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_piles(folder / "ipa" / "testing" / "brick", brick, pile_records(brick, 2, (5,), first=9))
     write_piles(folder / "bop" / "brick" / "train", brick, records, "bop")
     return folder
-
-
-@pytest.fixture(scope="module")
-def store(put_tables: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("tracking") / "mlflow.db"
-    put_tables(path)
-    return str(path)
 
 
 @pytest.fixture

@@ -8,24 +8,12 @@ import numpy as np
 import pytest
 import view
 from configuration import ConfigurationError, compose
-from scipy.spatial import ConvexHull
 
-from attentionvote.part import Part
-from attentionvote.simulation import decomposition, load_part, scene_set, scene_set_directory, scene_set_specs
+from attentionvote.simulation import load_part, scene_set, scene_set_directory, scene_set_specs
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]
 TINY += [f"simulation.camera.camera.{key}" for key in ("width=344", "height=257", "fx=567.0", "fy=567.0")]
 TINY += ["simulation.camera.camera.cx=172.0", "simulation.camera.camera.cy=128.5"]
-
-
-def one_hull(part: Part, *_: object) -> tuple:
-    return (part.vertices[ConvexHull(part.vertices).vertices],)
-
-
-@pytest.fixture(autouse=True)
-def quick_hulls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
-    monkeypatch.setattr(decomposition, "convex_hulls", one_hull)
 
 
 def run(directory: Path, *overrides: str) -> dict:

@@ -13,26 +13,14 @@ import pytest
 import write_data
 from configuration import ConfigurationError, compose
 from refusal import Refused
-from scipy.spatial import ConvexHull
 
 from attentionvote.datasets import open_datasets
-from attentionvote.part import Part
-from attentionvote.simulation import decomposition, scene_set
 from attentionvote.simulation.scene_set import SceneSet
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.test=1", "simulation.drop_counts=[2,5]", "workers=1"]
 TINY += [f"simulation.camera.camera.{key}" for key in ("width=344", "height=257", "fx=567.0", "fy=567.0")]
 TINY += ["simulation.camera.camera.cx=172.0", "simulation.camera.camera.cy=128.0"]
 STILL = [f"simulation.camera.{key}=0.0" for key in ("distance_jitter", "shift", "tilt_degrees", "roll_degrees")]
-
-
-@pytest.fixture(autouse=True)
-def quick_hulls(monkeypatch: pytest.MonkeyPatch) -> None:
-    def one_hull(part: Part, *_: object) -> tuple:
-        return (part.vertices[ConvexHull(part.vertices).vertices],)
-
-    monkeypatch.setattr(scene_set, "convex_hulls", one_hull)
-    monkeypatch.setattr(decomposition, "convex_hulls", one_hull)
 
 
 @pytest.fixture(scope="module")
