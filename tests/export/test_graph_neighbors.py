@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from attentionvote.export import graph_neighbors
-from attentionvote.export.onnx_file import OPSET, quiet_exporter
+from attentionvote.export.graph_operators import OPSET, write_out
+from attentionvote.export.onnx_file import quiet_exporter
 from attentionvote.model import Layout
 from attentionvote.model.neighborhoods import find_neighborhoods
 
@@ -32,6 +33,7 @@ def finder() -> onnxruntime.InferenceSession:
     with quiet_exporter(), torch.no_grad():
         program = torch.onnx.export(Finder(), (torch.rand(1, COUNT, 3),), input_names=["points"], opset_version=OPSET)
     assert program is not None
+    write_out(program.model)
     buffer = io.BytesIO()
     program.save(buffer)
     return onnxruntime.InferenceSession(buffer.getvalue(), providers=["CPUExecutionProvider"])

@@ -62,7 +62,7 @@ class GraphSetAbstraction(nn.Module):
 
 
 class GraphRefiner(nn.Module):
-    """``Refiner`` of a batch of one, a pose at a time."""
+    """``Refiner`` of a batch of one, a few poses at a time."""
 
     def __init__(self, layer: Refiner) -> None:
         super().__init__()
@@ -80,26 +80,35 @@ class GraphRefiner(nn.Module):
         """One correction of every pose; ``sample`` is all zeros."""
         del sample
         layer, weights = self.layer, list(self.layer.weights)
-        xyz, directions = points[0].T, normals[0]
         total, count = points.shape[1], min(layer.points, points.shape[1])
-        low, high = (corner.clone() for corner in layer.box)
+        chunk = _chunk(len(center), layer.points)
+        # Around the middle of the cloud: float32 has more digits there.
+        middle = points[0].mean(0)
+        columns = torch.cat([points[0] - middle, torch.ones(total, 1)], dim=1).T.contiguous()
+        cloud = torch.cat([points[0], normals[0]], dim=1)
+        low, high = (corner.view(3, 1, 1).clone() for corner in layer.box)
+        scale = torch.tensor([layer.scale] * 3 + [1.0] * 3)
         # First in index order = largest of a falling rank; 0 for a point outside.
         rank = torch.arange(total, 0, -1, dtype=torch.float32)
 
-        def step(carry: Tensor, pose: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            middle, turn = pose
-            local = turn.T @ (xyz - middle[:, None])
-            inside = torch.minimum(local - low[:, None], high[:, None] - local).amin(0) >= 0
-            found, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count)
-            number = (found > 0).sum()
-            index = index[torch.arange(layer.points) % number.clamp(min=1)]
-            seen = torch.cat([local[:, index].T * layer.scale, directions[index] @ turn], dim=-1)
-            seen = seen * (number > 0).to(seen.dtype)
-            pooled = pooled_mlp_reference(seen[None], None, index[None], weights)
-            return carry.clone(), pooled[0]
+        def step(carry: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            center, turn = poses
+            shift = (center - middle)[:, None] @ turn
+            rows = torch.cat([turn.transpose(1, 2), -shift.transpose(1, 2)], dim=2).transpose(0, 1)
+            local = (rows.reshape(3 * chunk, 4) @ columns).view(3, chunk, total)
+            x, y, z = torch.minimum(local - low, high - local).unbind(0)
+            inside = torch.minimum(torch.minimum(x, y), z) >= 0
+            found, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count, dim=1)
+            number = (found > 0).sum(1, keepdim=True)
+            index = torch.gather(index, 1, torch.arange(layer.points) % number.clamp(min=1))
+            offset = torch.cat([center, torch.zeros_like(center)], dim=1)[:, None]
+            seen = (cloud[index] - offset).view(chunk, 2 * layer.points, 3) @ turn
+            seen = seen.view(chunk, layer.points, 6) * scale * (number > 0).to(seen.dtype)[:, None]
+            return carry.clone(), pooled_mlp_reference(seen, None, index, weights)
 
-        _, pooled = scan(step, torch.zeros(1), (center, rotation))
-        return layer.correct(pooled, center, rotation, context)
+        blocks = (center.view(-1, chunk, 3), rotation.view(-1, chunk, 3, 3))
+        _, pooled = scan(step, torch.zeros(1), blocks)
+        return layer.correct(pooled.view(len(center), -1), center, rotation, context)
 
 
 class GraphFarthestVotes(FarthestVotes):

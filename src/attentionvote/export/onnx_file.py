@@ -14,9 +14,8 @@ import torch
 
 from attentionvote.contract import CARD_KEY, INPUTS, ModelCard, TensorSpec
 from attentionvote.export.graph_network import ExportNetwork
+from attentionvote.export.graph_operators import OPSET, write_out
 from attentionvote.model import AttentionVote, Predictions
-
-OPSET = 20
 
 
 def export_graph(model: AttentionVote, card: ModelCard) -> bytes:
@@ -34,7 +33,7 @@ def export_graph(model: AttentionVote, card: ModelCard) -> bytes:
     """
     points, normals = _example(card.points)
     with quiet_exporter(), uncollected(), torch.no_grad():
-        traced = torch.export.export(ExportNetwork(model).eval(), (points, normals), strict=True)
+        traced = torch.export.export(ExportNetwork(model).eval(), (points, normals), strict=False)
         program = torch.onnx.export(
             traced,
             dynamo=True,
@@ -44,6 +43,7 @@ def export_graph(model: AttentionVote, card: ModelCard) -> bytes:
             verbose=False,
         )
     assert program is not None
+    write_out(program.model)
     graph = program.model_proto
     _strip(graph.graph)
     del graph.metadata_props[:]
