@@ -94,7 +94,7 @@ def test_heat_and_peaks_equal_a_dense_convolution(seed: int, count: int, window:
 @given(st.integers(0, 2**31), st.integers(1, 80), st.sampled_from([1, 2, 3]), st.sampled_from([2, 6, 20]))
 def test_kernel_equals_reference(seed: int, count: int, window: int, extent: int) -> None:
     votes = scattered(seed, count, extent, samples=2)
-    actual, expected = proposals._heatmap(votes, VOXEL, window), heatmap_reference(votes, VOXEL, window)
+    actual, expected = proposals.Heatmap()(votes, VOXEL, window), heatmap_reference(votes, VOXEL, window)
     torch.testing.assert_close(actual[0], expected[0], rtol=1e-5, atol=0)
     torch.testing.assert_close(actual[1], expected[1], rtol=0, atol=0)
     torch.testing.assert_close(actual[2], expected[2], rtol=0, atol=1e-7)

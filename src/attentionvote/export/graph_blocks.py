@@ -58,13 +58,13 @@ def in_blocks(op: Any, planes: ir.Value, count: int, size: int) -> Blocks:
 
 
 def squared_length(op: Any, differences: ir.Value) -> ir.Value:
-    """``(3, ...)`` to ``(...)``: x^2 + y^2 + z^2 in the order in which the C operators add."""
+    """``(3, ...)`` to ``(1, ...)``: x^2 + y^2 + z^2 in the order in which the C operators add."""
     x, y, z = op.Split(op.Mul(differences, differences), num_outputs=3, axis=0, _outputs=3)
-    return op.Squeeze(op.Add(op.Add(x, y), z), [0])
+    return op.Add(op.Add(x, y), z)
 
 
 def squared_gap(op: Any, blocks: Blocks, low: ir.Value, high: ir.Value) -> ir.Value:
-    """``(boxes, blocks)``: squared distance of each block's box from other boxes, ``(3, boxes, 1)`` their corners.
+    """``(1, boxes, blocks)``: squared distance of each block's box from other boxes, ``(3, boxes, 1)`` their corners.
 
     Never more than the squared distance of two points in them, not even by rounding: every operation on the way is the
     same as for the points, and none of them reverses an order.

@@ -59,7 +59,7 @@ def three_nearest(
 @operator("FarthestPoints")
 def _farthest_points(op: Any, points: ir.Value, count: int) -> ir.Value:
     planes, number = op.Transpose(points, perm=[1, 0]), _number(points)
-    return farthest_points(op, planes, in_blocks(op, planes, number, _block(number)), count)
+    return farthest_points(op, planes, in_blocks(op, planes, number, _block(number)), number, count)
 
 
 @operator("Neighborhoods")
@@ -68,7 +68,7 @@ def _neighborhoods(
 ) -> list[ir.Value]:
     below, number = op.Transpose(points, perm=[1, 0]), _number(points)
     blocks = in_blocks(op, below, number, max(_block(number), neighbors[0]))
-    order = farthest_points(op, below, blocks, centers[0])
+    order = farthest_points(op, below, blocks, number, centers[0])
     ordered, found = op.Gather(below, order, axis=1), []
     for size, count, radius in zip(centers, neighbors, radii, strict=True):
         chosen = op.Slice(ordered, [0], [size], [1])

@@ -84,8 +84,8 @@ def constant(op: Any, values: ArrayLike) -> ir.Value:
     return value
 
 
-def value(name: str, kind: ir.DataType, shape: Sequence[int]) -> ir.Value:
-    """An input or output of an inner graph."""
+def value(name: str, kind: ir.DataType, shape: Sequence[int | None]) -> ir.Value:
+    """An input or output of an inner graph; None: a length that changes."""
     return ir.Value(name=name, type=ir.TensorType(kind), shape=ir.Shape(shape))
 
 

@@ -16,7 +16,7 @@ from attentionvote.model.layers import shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
 from attentionvote.model.precision import widened
 from attentionvote.model.predictions import Poses, Predictions, Votes
-from attentionvote.model.proposals import Peaks, gather_votes, heatmap_peaks
+from attentionvote.model.proposals import Heatmap, Peaks, gather_votes, heatmap_peaks
 from attentionvote.model.refinement import Refined, Refiner
 from attentionvote.model.rotation import (
     matrix_from_quaternion,
@@ -119,6 +119,7 @@ class AttentionVote(nn.Module):
         self.vote_rotation = nn.Linear(width, rotation_size) if vote_rotation else None
         # A module without weights: the exporter puts its own in its place.
         self.farthest = FarthestVotes() if proposal_source == "fps" else None
+        self.heatmap = Heatmap()
         self.fusion = FUSIONS[fusion_kind](width, fusion)
         self.head = shared_mlp(self.fusion.width, head)
         self.output = nn.Linear(head[-1], 3 + rotation_size + classes + 1)
@@ -150,7 +151,7 @@ class AttentionVote(nn.Module):
         xyz = votes.xyz.detach()
         if self.farthest is not None:
             return farthest_vote_peaks(xyz, self.farthest(xyz, min(self.proposals, xyz.shape[1])))
-        return heatmap_peaks(xyz, self.voxel_size, self.proposals, self.peak_window, self.center_seed)
+        return heatmap_peaks(xyz, self.voxel_size, self.proposals, self.peak_window, self.center_seed, self.heatmap)
 
     def regress(self, votes: Votes, peaks: Peaks, rows: Int[Tensor, " rows"] | None = None) -> Poses:
         """Poses of proposals from the votes around them (sections 3.3, 3.4).

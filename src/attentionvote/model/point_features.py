@@ -10,7 +10,7 @@ from torch import Tensor
 from attentionvote.geometry import native
 
 CHANNELS = 10
-_TINY = 1e-6  # the exporter deletes additions below 1e-8
+TINY = 1e-6  # the exporter deletes additions below 1e-8
 
 
 def pair_features_reference(
@@ -32,7 +32,7 @@ def pair_features_reference(
     offset = points[index] - centers[:, None]
     normal = normals[index]
     distance = offset.norm(dim=-1, keepdim=True)
-    unit = offset / (distance + _TINY)
+    unit = offset / (distance + TINY)
     center_normal = center_normals[:, None].expand_as(normal)
     cosines = [
         (a * b).sum(-1, keepdim=True) for a, b in ((center_normal, unit), (normal, unit), (center_normal, normal))

@@ -12,15 +12,15 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from attentionvote.geometry import native
 from attentionvote.model.precision import full_precision
 
 # The paper's kernel: 3x3x3, sigma one voxel, sum one: centre 0.0923, face 0.0560, edge 0.0339, corner 0.0206.
-_SIDE = math.exp(-0.5)
-_CENTER = 1.0 / (1.0 + 2.0 * _SIDE) ** 3
-_TIE = 1e-4  # heats closer than this are equal: a thousandth of a vote, far above the rounding of a sum of hundreds
+SIDE = math.exp(-0.5)
+CENTER = 1.0 / (1.0 + 2.0 * SIDE) ** 3
+TIE = 1e-4  # heats closer than this are equal: a thousandth of a vote, far above the rounding of a sum of hundreds
 
 
 class Peaks(NamedTuple):
@@ -43,6 +43,7 @@ def heatmap_peaks(
     count: int,
     window: int = 1,
     center_seed: str = "mean",
+    heatmap: nn.Module | None = None,
 ) -> Peaks:
     """The ``count`` hottest local peaks.
 
@@ -57,14 +58,15 @@ def heatmap_peaks(
         window: half width of the neighbourhood in voxels.
         center_seed: ``voxel`` for the voxel's centre (the paper's), ``mean`` for the heat-weighted mean of the votes
             in the 3x3x3 voxels, which does not jump with the grid.
+        heatmap: what stands in for ``Heatmap``.
     """
     with full_precision(votes.device):
-        heat, beaten, mean = _heatmap(votes, voxel_size, window)
+        heat, beaten, mean = (heatmap or Heatmap())(votes, voxel_size, window)
     height = heat * (1.0 - beaten)
     # Equal heats in the order of their votes, whatever computes the sum: the same peaks in training and in the cell.
     total = votes.shape[1]
     later = torch.arange(total, device=votes.device)
-    at = torch.topk(torch.round(height / _TIE).long() * total - later, min(count, total), dim=1)[1]
+    at = torch.topk(torch.round(height / TIE).long() * total - later, min(count, total), dim=1)[1]
     peak_heat = torch.take_along_dim(height, at, dim=1)
     seeds = mean if center_seed == "mean" else (torch.floor(votes / voxel_size) + 0.5) * voxel_size
     batch = torch.arange(len(votes), device=votes.device)[:, None]
@@ -79,29 +81,35 @@ def heatmap_reference(
     # Axis by axis: matrices M x M stay contiguous, which a last dimension of three would not.
     x, y, z = (a[:, :, None] - a[:, None] for a in voxel.unbind(-1))
     # exp(-d^2 / 2) at d = 0 and +-1, and 0 beyond: exact on integers.
-    gx, gy, gz = (torch.relu(1.0 - (1.0 - _SIDE) * d.square()) for d in (x, y, z))
-    weight = _CENTER * (gx * gy * gz)
+    gx, gy, gz = (torch.relu(1.0 - (1.0 - SIDE) * d.square()) for d in (x, y, z))
+    weight = CENTER * (gx * gy * gz)
     heat = weight.sum(-1)
     near = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= window
     index = torch.arange(votes.shape[1], device=votes.device)
     # Equal voxels have equal heat only up to the order of summation; the tolerance restores the tie.
     ahead = heat[:, None] - heat[:, :, None]
     earlier = index[None, :] < index[:, None]
-    beaten = near & ((ahead > _TIE) | ((ahead.abs() <= _TIE) & earlier))
+    beaten = near & ((ahead > TIE) | ((ahead.abs() <= TIE) & earlier))
     return heat, beaten.to(heat.dtype).amax(-1), weight @ votes / heat[..., None]
 
 
-def _heatmap(votes: Tensor, voxel_size: float, window: int) -> tuple[Tensor, Tensor, Tensor]:
-    plain = votes.device.type == "cpu" and votes.dtype == torch.float32 and not torch.compiler.is_compiling()
-    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
-    if library is None:
-        return heatmap_reference(votes, voxel_size, window)
-    batch, count, _ = votes.shape
-    heat, beaten, mean = torch.empty(batch, count), torch.empty(batch, count), torch.empty(batch, count, 3)
-    for one, *out in zip(votes.detach().contiguous(), heat, beaten, mean, strict=True):
-        arrays = [t.numpy() for t in out]
-        native.call(library.heatmap, one.numpy(), count, float(voxel_size), window, _CENTER, _SIDE, _TIE, *arrays)
-    return heat, beaten, mean
+class Heatmap(nn.Module):
+    """``heatmap_reference`` by the fastest means at hand; a module, so that the exporter can put another in its place."""
+
+    def forward(
+        self, votes: Float[Tensor, "batch votes 3"], voxel_size: float, window: int
+    ) -> tuple[Float[Tensor, "batch votes"], Float[Tensor, "batch votes"], Float[Tensor, "batch votes 3"]]:
+        """What ``heatmap_reference`` answers."""
+        plain = votes.device.type == "cpu" and votes.dtype == torch.float32 and not torch.compiler.is_compiling()
+        library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+        if library is None:
+            return heatmap_reference(votes, voxel_size, window)
+        batch, count, _ = votes.shape
+        heat, beaten, mean = torch.empty(batch, count), torch.empty(batch, count), torch.empty(batch, count, 3)
+        for one, *out in zip(votes.detach().contiguous(), heat, beaten, mean, strict=True):
+            arrays = [t.numpy() for t in out]
+            native.call(library.heatmap, one.numpy(), count, float(voxel_size), window, CENTER, SIDE, TIE, *arrays)
+        return heat, beaten, mean
 
 
 def gather_votes(
