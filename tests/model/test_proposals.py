@@ -50,7 +50,7 @@ def dense(votes: np.ndarray, window: int) -> tuple[np.ndarray, dict[tuple, float
 
 
 def test_kernel_has_the_papers_values() -> None:
-    corner = [proposals._CENTER * proposals._SIDE**k for k in range(4)]
+    corner = [proposals.CENTER * proposals.SIDE**k for k in range(4)]
     np.testing.assert_allclose(corner, [0.0923, 0.0560, 0.0339, 0.0206], atol=5e-5)
     np.testing.assert_allclose(np.dot(corner, [1, 6, 12, 8]), 1.0, rtol=1e-12)
 

@@ -16,9 +16,7 @@ from attentionvote.export.graph_operators import BOOL, FLOAT, INT, constant, inn
 CHUNK = 16  # centres a step
 
 
-def ball_query(
-    op: Any, blocks: Blocks, centers: ir.Value, number: int, radius: float, count: int
-) -> ir.Value:
+def ball_query(op: Any, blocks: Blocks, centers: ir.Value, number: int, radius: float, count: int) -> ir.Value:
     """``(number, count)`` indices: the first ``count`` points in index order within ``radius`` of each centre.
 
     Short balls are padded with their first. Every centre is one of the points, so no ball is empty.

@@ -16,14 +16,14 @@ class Blocks(NamedTuple):
     """Points in blocks.
 
     Args:
-        index: ``(blocks, size)`` int64, of the points. The last ones repeat a point where the blocks have more places.
+        indices: ``(blocks, size)`` int64, of the points. The last ones repeat a point where the blocks have more places.
         label: the same as float32, but ``NOWHERE`` at repetitions.
         points: ``(3, blocks, size)``.
         low, high: ``(3, 1, blocks)`` corners of their boxes.
         shape: blocks and places in each.
     """
 
-    index: ir.Value
+    indices: ir.Value
     label: ir.Value
     points: ir.Value
     low: ir.Value

@@ -51,7 +51,12 @@ def farthest_points(op: Any, planes: ir.Value, blocks: Blocks, number: int, coun
         op,
         "round",
         body,
-        [value("turn", INT, []), value("before", BOOL, [1]), value("from", FLOAT, [number]), value("some", INT, [None])],
+        [
+            value("turn", INT, []),
+            value("before", BOOL, [1]),
+            value("from", FLOAT, [number]),
+            value("some", INT, [None]),
+        ],
         [value("after", BOOL, [1]), value("to", FLOAT, [number]), value("more", INT, [None])],
     )
     order = op.Loop(None, constant(op, [count > 1]), nearest, constant(op, [0]), body=step, _outputs=2)[1]
@@ -86,5 +91,5 @@ def _lowered(
     point, block = op.Gather(pairs, 1, axis=0), op.Gather(pairs, 2, axis=0)
     squared = squared_length(op, op.Sub(op.Gather(blocks.points, block, axis=1), op.Gather(points, point, axis=1)))
     # Not ScatterND: onnxruntime runs that on several threads, and two points may lower the same third.
-    index = op.Reshape(op.Gather(blocks.index, block, axis=0), [-1])
+    index = op.Reshape(op.Gather(blocks.indices, block, axis=0), [-1])
     return op.ScatterElements(nearest, index, op.Reshape(squared, [-1]), axis=0, reduction="min")

@@ -1,9 +1,9 @@
 """Layers of the network in the order of work that suits a CPU runtime: a few rows at a time, in the cache.
 
-Each does what the layer of ``model`` does that it stands for, for a batch of one. Shared MLPs with their maximum, the view
-of the refinement and the heatmap go through a ``scan``, so that what they make on the way stays in the cache: the largest
-single gain of the exported graph. Points are gathered by rows and calculated with by planes, x and y and z apart, because
-sums over a last dimension of three are slow.
+Each does, for a batch of one, what the layer of ``model`` does that it stands for. Shared MLPs with their maximum, the
+view of the refinement and the heatmap go through a ``scan``, so that what they make on the way stays in the cache: the
+largest single gain of the exported graph. Points are gathered by rows but calculated with by planes, x and y and z
+apart, because sums over a last dimension of three are slow.
 """
 
 from __future__ import annotations
@@ -65,9 +65,7 @@ class GraphSetAbstraction(nn.Module):
         return layer.finish(pooled.reshape(count, -1))[None]
 
 
-def _pair_features(
-    near: Float[Tensor, "rows 6"], middle: Float[Tensor, "centers 6"]
-) -> Float[Tensor, "channels rows"]:
+def _pair_features(near: Float[Tensor, "rows 6"], middle: Float[Tensor, "centers 6"]) -> Float[Tensor, "channels rows"]:
     """What ``pair_features`` is made of, by planes, all neighbours of a centre in succession: offset, normal, distance,
     and the products whose sums are the cosines."""
     planes, own = near.T.reshape(6, len(middle), -1), middle.T[:, :, None]
@@ -112,12 +110,12 @@ class GraphRefiner(nn.Module):
         del sample
         layer, weights = self.layer, list(self.layer.weights)
         total, count = points.shape[1], min(layer.points, points.shape[1])
-        chunk = _divisor(len(center), max(1, _POSES))
+        chunk = _divisor(len(center), _POSES)
         # Around the middle of the cloud: float32 has more digits there.
         middle = points[0].mean(0)
         columns = torch.cat([points[0] - middle, torch.ones(total, 1)], dim=1).T.contiguous()
         cloud = torch.cat([points[0], normals[0]], dim=1)
-        half, inner = (layer.box[1] - layer.box[0]) / 2, (layer.box[1] + layer.box[0]) / 2
+        half, box_middle = (layer.box[1] - layer.box[0]) / 2, (layer.box[1] + layer.box[0]) / 2
         scale = torch.tensor([layer.scale] * 3 + [1.0] * 3)
         # First in index order = largest of a falling rank; 0 for a point outside.
         rank = torch.arange(total, 0, -1, dtype=torch.float32)
@@ -125,7 +123,7 @@ class GraphRefiner(nn.Module):
         def step(carry: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
             center, turn = poses
             # In units of the box around its middle: inside is what lies within one in every direction.
-            shift = (center - middle)[:, None] @ turn + inner
+            shift = (center - middle)[:, None] @ turn + box_middle
             rows = torch.cat([turn.transpose(1, 2), -shift.transpose(1, 2)], dim=2) / half[:, None]
             x, y, z = (rows.transpose(0, 1).reshape(3 * chunk, 4) @ columns).abs().view(3, chunk, total).unbind(0)
             inside = torch.maximum(torch.maximum(x, y), z) <= 1

@@ -1,9 +1,8 @@
 """Farthest points, ball query and nearest three inside the exported graph, for a batch of one.
 
 Same meaning as the C operators of ``geometry.sampling`` and the same order of operations in float32, so that the graph
-chooses the same points and neighbours and the poses of both differ by rounding only. Shapes are static outside of the
-operators that ``graph_farthest_points`` and ``graph_ball_query`` write. These functions are for export: called outside of
-a trace, the operators answer zeros.
+chooses the same points and neighbours and the poses of both differ by rounding only. These functions are for export:
+outside of a trace the operators answer zeros.
 """
 
 from __future__ import annotations
@@ -69,7 +68,8 @@ def _neighborhoods(
     below, number = op.Transpose(points, perm=[1, 0]), _number(points)
     blocks = in_blocks(op, below, number, max(_block(number), neighbors[0]))
     order = farthest_points(op, below, blocks, number, centers[0])
-    ordered, found = op.Gather(below, order, axis=1), []
+    ordered = op.Gather(below, order, axis=1)
+    found: list[ir.Value] = []
     for size, count, radius in zip(centers, neighbors, radii, strict=True):
         chosen = op.Slice(ordered, [0], [size], [1])
         if found:
@@ -81,7 +81,9 @@ def _neighborhoods(
 
 def _number(points: ir.Value) -> int:
     assert points.shape is not None
-    return int(points.shape[0])
+    number = points.shape[0]
+    assert isinstance(number, int)
+    return number
 
 
 def _block(number: int) -> int:

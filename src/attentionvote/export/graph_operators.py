@@ -1,9 +1,9 @@
 """Operators of this project in the exported graph: traced as one call each, then written out in standard operators.
 
-torch's exporter knows neither loops whose tensors change their size nor updates that keep the smaller value, and both are
-what makes these operators fast. So the traced network calls them by name (``traced_operator``), and ``write_out`` puts
-what ``operator`` registered under that name in the place of every call. What is registered is written with onnxscript's
-builder: ``op.Sub(a, b)`` adds a node.
+torch's exporter knows neither loops whose tensors change their size nor updates that keep the smaller value, and both
+are what makes these operators fast. So the traced network calls them by name (``traced_operator``), and ``write_out``
+puts what ``operator`` registered under that name in the place of every call. What is registered is written with
+onnxscript's builder: ``op.Sub(a, b)`` adds a node to the graph and answers its output.
 """
 
 from __future__ import annotations

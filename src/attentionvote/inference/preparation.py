@@ -140,12 +140,12 @@ def prepare(
         TooFewPoints: when fewer points are left than normals need.
     """
     cloud, given = checked_cloud(points)
-    check_unit(cloud, card)
-    seen = len(cloud)
+    seen, least = len(cloud), fewest_points(card)
+    if crop is not None or seen < least:  # otherwise check_scene says the same, and more
+        check_unit(cloud, card)
     if crop is not None:
         between()
         cloud = cloud[crop.inside(cloud)]
-    least = fewest_points(card)
     if len(cloud) < least:
         where = f" are left in the bin of {seen} measured" if crop is not None else " were measured"
         raise TooFewPoints(f"{len(cloud)} points{where}, at least {least} are needed to look for parts", len(cloud))
@@ -179,10 +179,12 @@ def checked_cloud(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
         flat = flat[~np.isnan(flat).any(axis=1)]
     with np.errstate(over="ignore"):
         cloud = flat.astype(np.float32)
-    finite = np.isfinite(cloud).all(axis=1)
-    if not finite.all():
+    if not np.isfinite(cloud).all():
+        finite = np.isfinite(cloud).all(axis=1)
         remedy = "drop them, or send the organised cloud (H, W, 3) in which NaN is missing"
         if points.ndim == 3:
             remedy = "in an organised cloud a missing point is NaN"
         raise InputError(f"points must be finite, got {int((~finite).sum())} of {given} with NaN or inf: {remedy}")
-    return np.ascontiguousarray(cloud[cloud.any(axis=1)]), given
+    if not cloud[:, 2].all():  # a missing point is at the camera; few sensors send any
+        cloud = cloud[cloud.any(axis=1)]
+    return np.ascontiguousarray(cloud), given

@@ -94,7 +94,7 @@ def heatmap_reference(
 
 
 class Heatmap(nn.Module):
-    """``heatmap_reference`` by the fastest means at hand; a module, so that the exporter can put another in its place."""
+    """``heatmap_reference`` by the fastest means at hand; a module, so that the exporter can replace it."""
 
     def forward(
         self, votes: Float[Tensor, "batch votes 3"], voxel_size: float, window: int
