@@ -14,7 +14,7 @@ from attentionvote.model.proposals import Peaks
 
 
 class FarthestVotes(nn.Module):
-    """Farthest-point order of the votes; a module, so that the exporter can put an ONNX Scan in its place."""
+    """Farthest-point order of the votes; a module, so that the exporter can replace it."""
 
     def forward(self, votes: Float[Tensor, "batch votes 3"], count: int) -> Int[Tensor, "batch count"]:
         """Indices of ``count`` votes of each sample, each the farthest from all before it, from vote 0 on.
