@@ -40,13 +40,16 @@ SMALL: dict[str, Any] = {
 
 
 @pytest.fixture(scope="session")
-def kernels() -> ctypes.CDLL:
-    """The compiled kernels; without them the tests would compare the references with themselves."""
+def kernels() -> dict[str, ctypes.CDLL]:
+    """The compiled kernels by file; without them the tests would compare the references with themselves."""
     if shutil.which("cc") is None:
         pytest.skip("no C compiler on this machine")
-    library = native.load("attentionvote.model", "network_ops.c", tuned=True)
-    assert library is not None
-    return library
+    found = {}
+    for file in ("pooled_mlp.c", "network_ops.c"):
+        library = native.load("attentionvote.model", file, tuned=True)
+        assert library is not None
+        found[file] = library
+    return found
 
 
 def small_network(seed: int = 0, **changes: Any) -> AttentionVote:

@@ -179,6 +179,9 @@ def test_weights_stored_column_by_column_give_the_same() -> None:
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
-def test_the_library_is_the_one_of_this_package(kernels: ctypes.CDLL) -> None:
-    for name in ("pooled_forward", "pooled_backward", "pair_features", "points_in_box", "heatmap"):
-        assert hasattr(kernels, name)
+def test_the_libraries_are_those_of_this_package(kernels: dict[str, ctypes.CDLL]) -> None:
+    for file, names in {
+        "pooled_mlp.c": ("pooled_forward", "pooled_backward"),
+        "network_ops.c": ("pair_features", "points_in_box", "heatmap"),
+    }.items():
+        assert all(hasattr(kernels[file], name) for name in names)

@@ -1,256 +1,16 @@
-/* The arithmetic of a set abstraction on a CPU: shared MLP over the neighbours of a centre, then the maximum.
+/* The small functions of the network on a CPU: what a centre is told about its neighbours, the points in a part's box,
+ * and the heatmap of the votes.
  *
- * Everything of one centre stays in the first-level cache; the backward pass recomputes the hidden layers and uses
- * that the maximum hands its gradient to one neighbour a channel, so the widest layer costs almost nothing there.
- * Called through ctypes by model/pooled_mlp.py, whose reference formulation is the oracle of the tests. Weights of
- * layer l: forward takes them as (in, out) rows, backward also as (out, in). All widths are multiples of 8. Where the
- * processor has AVX-512, whole tiles are of 16 numbers; every number stays the same sum in the same order.
+ * Called through ctypes by model/point_features.py, refinement.py and proposals.py, whose reference formulations are
+ * the oracles of the tests. Numbers that belong together are laid out one kind after the other, so that the compiler
+ * computes as many at once as the processor can. Each works on rows from..to, so that threads can share them.
  */
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
-typedef float v8 __attribute__((vector_size(32), aligned(4)));
-#define V(p) (*(v8 *)(p))
-#define C(p) (*(const v8 *)(p))
-
-typedef int32_t i8 __attribute__((vector_size(32)));
-
-static v8 relu_of(v8 s) { return (v8)((s > (v8){0}) & (i8)s); }
-
-#ifdef __AVX512F__
-typedef float v16 __attribute__((vector_size(64), aligned(4)));
-typedef int32_t i16 __attribute__((vector_size(64)));
-#define WIDE_ROWS 8
-#define WIDE_COLUMNS 32
-
-/* linear for whole tiles of 8 rows and 32 columns; every number is the same sum in the same order. */
-static void linear_wide(const float *in, int rows, int n_in, const float *weights, const float *bias, int n_out,
-                        float *out, int relu) {
-    for (int o = 0; o < n_out; o += WIDE_COLUMNS)
-        for (int r = 0; r < rows; r += WIDE_ROWS) {
-            const float *x = in + (int64_t)r * n_in, *w = weights + o;
-            v16 a[WIDE_ROWS], b[WIDE_ROWS];
-            for (int j = 0; j < WIDE_ROWS; j++)
-                a[j] = *(const v16 *)(bias + o), b[j] = *(const v16 *)(bias + o + 16);
-            for (int i = 0; i < n_in; i++, w += n_out) {
-                const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
-                for (int j = 0; j < WIDE_ROWS; j++) {
-                    const float v = x[(int64_t)j * n_in + i];
-                    a[j] += v * w0, b[j] += v * w1;
-                }
-            }
-            float *y = out + (int64_t)r * n_out + o;
-            for (int j = 0; j < WIDE_ROWS; j++, y += n_out) {
-                if (relu) a[j] = (v16)((a[j] > (v16){0}) & (i16)a[j]), b[j] = (v16)((b[j] > (v16){0}) & (i16)b[j]);
-                *(v16 *)y = a[j], *(v16 *)(y + 16) = b[j];
-            }
-        }
-}
-
-/* sums[n_left][n_right] += transpose(left[rows][n_left]) * right[rows][n_right], in tiles as above. */
-static void outer_wide(const float *left, int n_left, const float *right, int n_right, int rows, float *sums) {
-    for (int i = 0; i < n_left; i += WIDE_ROWS)
-        for (int o = 0; o < n_right; o += WIDE_COLUMNS) {
-            v16 a[WIDE_ROWS], b[WIDE_ROWS];
-            float *y = sums + (int64_t)i * n_right + o;
-            for (int j = 0; j < WIDE_ROWS; j++)
-                a[j] = *(const v16 *)(y + (int64_t)j * n_right), b[j] = *(const v16 *)(y + (int64_t)j * n_right + 16);
-            for (int r = 0; r < rows; r++) {
-                const float *x = left + (int64_t)r * n_left + i, *w = right + (int64_t)r * n_right + o;
-                const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
-                for (int j = 0; j < WIDE_ROWS; j++) a[j] += x[j] * w0, b[j] += x[j] * w1;
-            }
-            for (int j = 0; j < WIDE_ROWS; j++)
-                *(v16 *)(y + (int64_t)j * n_right) = a[j], *(v16 *)(y + (int64_t)j * n_right + 16) = b[j];
-        }
-}
-#endif
-
-/* out[rows][n_out] = in[rows][n_in] * weights[n_in][n_out] + bias, optionally ReLU. */
-static void linear(const float *in, int rows, int n_in, const float *weights, const float *bias, int n_out, float *out,
-                   int relu) {
-#ifdef __AVX512F__
-    if (rows % WIDE_ROWS == 0 && n_out % WIDE_COLUMNS == 0) {
-        linear_wide(in, rows, n_in, weights, bias, n_out, out, relu);
-        return;
-    }
-#endif
-    const v8 zero = {0};
-    for (int o = 0; o < n_out; o += 16) {
-        const int wide = o + 8 < n_out;
-        for (int r = 0; r < rows; r += 4) {
-            const int left = rows - r;
-            const float *x0 = in + (int64_t)r * n_in, *x1 = left > 1 ? x0 + n_in : x0;
-            const float *x2 = left > 2 ? x0 + 2 * n_in : x0, *x3 = left > 3 ? x0 + 3 * n_in : x0;
-            const v8 b0 = C(bias + o), b1 = wide ? C(bias + o + 8) : zero;
-            v8 a00 = b0, a01 = b1, a10 = b0, a11 = b1, a20 = b0, a21 = b1, a30 = b0, a31 = b1;
-            const float *w = weights + o;
-            if (wide)
-                for (int i = 0; i < n_in; i++, w += n_out) {
-                    const v8 w0 = C(w), w1 = C(w + 8);
-                    a00 += x0[i] * w0, a01 += x0[i] * w1, a10 += x1[i] * w0, a11 += x1[i] * w1;
-                    a20 += x2[i] * w0, a21 += x2[i] * w1, a30 += x3[i] * w0, a31 += x3[i] * w1;
-                }
-            else
-                for (int i = 0; i < n_in; i++, w += n_out) {
-                    const v8 w0 = C(w);
-                    a00 += x0[i] * w0, a10 += x1[i] * w0, a20 += x2[i] * w0, a30 += x3[i] * w0;
-                }
-            float *y = out + (int64_t)r * n_out + o;
-            if (relu)
-                a00 = relu_of(a00), a01 = relu_of(a01), a10 = relu_of(a10), a11 = relu_of(a11), a20 = relu_of(a20),
-                a21 = relu_of(a21), a30 = relu_of(a30), a31 = relu_of(a31);
-            V(y) = a00;
-            if (left > 1) V(y + n_out) = a10;
-            if (left > 2) V(y + 2 * n_out) = a20;
-            if (left > 3) V(y + 3 * n_out) = a30;
-            if (!wide) continue;
-            V(y + 8) = a01;
-            if (left > 1) V(y + n_out + 8) = a11;
-            if (left > 2) V(y + 2 * n_out + 8) = a21;
-            if (left > 3) V(y + 3 * n_out + 8) = a31;
-        }
-    }
-}
-
-static void axpy(float a, const float *x, float *y, int n) {
-#ifdef __AVX512F__
-    if (n % 16 == 0) {
-        for (int i = 0; i < n; i += 16) *(v16 *)(y + i) += a * *(const v16 *)(x + i);
-        return;
-    }
-#endif
-    for (int i = 0; i < n; i += 8) V(y + i) += a * C(x + i);
-}
-
-/* A gradient behind a ReLU, which is added to the bias's. */
-static void gated(float *gradient, const float *hidden, int n, float *grad_bias) {
-    for (int i = 0; i < n; i++) gradient[i] = hidden[i] > 0.0f ? gradient[i] : 0.0f;
-    for (int i = 0; i < n; i += 8) V(grad_bias + i) += C(gradient + i);
-}
-
-/* Hidden layers of one centre: hidden[l] for l < layers - 1. The first adds the projected features of the level below. */
-static void hidden_layers(const float *geometry, int k, int channels, const float *projected, const int64_t *index,
-                          int layers, const int32_t *widths, const float *const *weights, const float *const *biases,
-                          float *const *hidden) {
-    linear(geometry, k, channels, weights[0], biases[0], widths[0], hidden[0], projected == NULL);
-    if (projected)
-        for (int j = 0; j < k; j++) {
-            const float *u = projected + index[j] * widths[0];
-            float *h = hidden[0] + (int64_t)j * widths[0];
-            for (int i = 0; i < widths[0]; i += 8) V(h + i) = relu_of(C(h + i) + C(u + i));
-        }
-    for (int l = 1; l < layers - 1; l++)
-        linear(hidden[l - 1], k, widths[l - 1], weights[l], biases[l], widths[l], hidden[l], 1);
-}
-
-/* out[c][width] = max over neighbours, winner[c][width] = which neighbour. */
-int pooled_forward(const float *geometry, int64_t from, int64_t to, int32_t k, int32_t channels, const float *projected,
-                   const int64_t *index, int32_t layers, const int32_t *widths, const float *const *weights,
-                   const float *const *biases, float *out, uint8_t *winner) {
-    float *hidden[8], *last;
-    const int top = widths[layers - 1];
-    size_t total = (size_t)k * top;
-    for (int l = 0; l < layers - 1; l++) total += (size_t)k * widths[l];
-    float *memory = malloc(sizeof(float) * total);
-    if (!memory) return 1;
-    last = memory;
-    float *next = memory + (size_t)k * top;
-    for (int l = 0; l < layers - 1; next += (size_t)k * widths[l], l++) hidden[l] = next;
-    for (int64_t c = from; c < to; c++) {
-        hidden_layers(geometry + c * k * channels, k, channels, projected, index ? index + c * k : NULL, layers, widths,
-                      weights, biases, hidden);
-        linear(hidden[layers - 2], k, widths[layers - 2], weights[layers - 1], biases[layers - 1], top, last, 0);
-        float *o = out + c * top;
-        uint8_t *win = winner + c * top;
-        memcpy(o, last, sizeof(float) * top);
-        memset(win, 0, top);
-        for (int j = 1; j < k; j++) {
-            const float *row = last + (int64_t)j * top;
-            for (int i = 0; i < top; i++) {
-                win[i] = row[i] > o[i] ? (uint8_t)j : win[i];
-                o[i] = row[i] > o[i] ? row[i] : o[i];
-            }
-        }
-    }
-    free(memory);
-    return 0;
-}
-
-/* Adds to grad_weights[l] (out, in), grad_biases[l] and grad_projected; transposed[l] is (out, in). */
-int pooled_backward(const float *geometry, int64_t from, int64_t to, int32_t k, int32_t channels, const float *projected,
-                    const int64_t *index, int32_t layers, const int32_t *widths, const float *const *weights,
-                    const float *const *biases, const float *const *transposed, const uint8_t *winner,
-                    const float *grad_out, float *const *grad_weights, float *const *grad_biases,
-                    float *grad_projected) {
-    float *hidden[8], *grads[8];
-    const int top = widths[layers - 1], n = layers - 1;
-    size_t total = 0, widest = 0;
-    for (int l = 0; l < n; l++) {
-        total += 2 * (size_t)k * widths[l];
-        widest = (size_t)widths[l] > widest ? (size_t)widths[l] : widest;
-    }
-    float *memory = malloc(sizeof(float) * total), *none = calloc(widest, sizeof(float)); /* no bias */
-    uint8_t *touched = malloc((size_t)k);
-    if (!memory || !touched || !none) {
-        free(memory), free(touched), free(none);
-        return 1;
-    }
-    float *next = memory;
-    for (int l = 0; l < n; next += 2 * (size_t)k * widths[l], l++)
-        hidden[l] = next, grads[l] = next + (size_t)k * widths[l];
-    for (int64_t c = from; c < to; c++) {
-        const float *g = geometry + c * k * channels, *grad = grad_out + c * top;
-        const uint8_t *win = winner + c * top;
-        hidden_layers(g, k, channels, projected, index ? index + c * k : NULL, layers, widths, weights, biases, hidden);
-        memset(touched, 0, (size_t)k);
-        memset(grads[n - 1], 0, sizeof(float) * (size_t)k * widths[n - 1]);
-        for (int i = 0; i < top; i++) {
-            const int64_t w = win[i];
-            if (grad[i] == 0.0f) continue;
-            touched[w] = 1;
-            axpy(grad[i], hidden[n - 1] + w * widths[n - 1], grad_weights[n] + (int64_t)i * widths[n - 1], widths[n - 1]);
-            axpy(grad[i], transposed[n] + (int64_t)i * widths[n - 1], grads[n - 1] + w * widths[n - 1], widths[n - 1]);
-            grad_biases[n][i] += grad[i];
-        }
-        int first = n - 1; /* the highest layer whose gradients still have to be handed down */
-#ifdef __AVX512F__
-        /* All neighbours together; the untouched ones' gradients are zero. */
-        for (; first > 0 && k % WIDE_ROWS == 0 && widths[first - 1] % WIDE_COLUMNS == 0; first--) {
-            const int width = widths[first], under = widths[first - 1];
-            for (int64_t j = 0; j < k; j++)
-                gated(grads[first] + j * width, hidden[first] + j * width, width, grad_biases[first]);
-            outer_wide(grads[first], width, hidden[first - 1], under, k, grad_weights[first]);
-            linear_wide(grads[first], k, width, transposed[first], none, under, grads[first - 1], 0);
-        }
-#endif
-        for (int j = 0; j < k; j++) {
-            if (!touched[j]) continue;
-            for (int l = first; l >= 0; l--) {
-                const int width = widths[l];
-                float *gh = grads[l] + (int64_t)j * width;
-                gated(gh, hidden[l] + (int64_t)j * width, width, grad_biases[l]);
-                if (l == 0) break;
-                const float *below = hidden[l - 1] + (int64_t)j * widths[l - 1];
-                float *gb = grads[l - 1] + (int64_t)j * widths[l - 1];
-                memset(gb, 0, sizeof(float) * widths[l - 1]);
-                for (int i = 0; i < width; i++) {
-                    if (gh[i] == 0.0f) continue;
-                    axpy(gh[i], below, grad_weights[l] + (int64_t)i * widths[l - 1], widths[l - 1]);
-                    axpy(gh[i], transposed[l] + (int64_t)i * widths[l - 1], gb, widths[l - 1]);
-                }
-            }
-            const float *gh = grads[0] + (int64_t)j * widths[0];
-            if (grad_projected) axpy(1.0f, gh, grad_projected + index[c * k + j] * widths[0], widths[0]);
-            /* The first layer's gradient is kept as (in, out): its input is narrower than a vector. */
-            for (int i = 0; i < channels; i++) axpy(g[(int64_t)j * channels + i], gh, grad_weights[0] + (int64_t)i * widths[0], widths[0]);
-        }
-    }
-    free(memory), free(touched), free(none);
-    return 0;
-}
+#define CHUNK 64
 
 /* Ten channels of every neighbour: offset / radius (3), its normal (3), distance / radius, and the three cosines of
  * the point pair feature. An index is within its sample: sample s of a level owns rows s * stride of points. */
@@ -278,62 +38,128 @@ int pair_features(const float *points, const float *normals, const float *center
 
 /* The first `count` points in index order that lie in a part's box (low..high, part frame) when the part is at pose q,
  * with their normals, in the part frame and in units of `scale`: out[q][count][6]. Fewer are repeated in turn; none
- * gives zeros. found[q] is the number of different points. */
+ * gives zeros. Rows of one sample that follow each other share its points laid out by axis. */
 int points_in_box(const float *points, const float *normals, int32_t n, const int64_t *sample, const float *center,
                   const float *rotation, int64_t from, int64_t to, const float *low, const float *high, float scale,
-                  int32_t count, float *out, int32_t *found) {
+                  int32_t count, float *out) {
+    float *x = malloc(sizeof(float) * 3 * (size_t)n), *y = x + n, *z = y + n;
+    if (!x) return 1;
+    int64_t held = -1;
     for (int64_t q = from; q < to; q++) {
         const float *p = points + 3 * n * sample[q], *m = normals + 3 * n * sample[q];
         const float *c = center + 3 * q, *r = rotation + 9 * q;
         float *o = out + q * count * 6;
+        if (held != sample[q])
+            for (int32_t i = 0; i < n; i++) x[i] = p[3 * i], y[i] = p[3 * i + 1], z[i] = p[3 * i + 2];
+        held = sample[q];
         int32_t have = 0;
-        for (int32_t i = 0; i < n && have < count; i++) {
-            const float x = p[3 * i] - c[0], y = p[3 * i + 1] - c[1], z = p[3 * i + 2] - c[2];
-            const float u = r[0] * x + r[3] * y + r[6] * z;
-            const float v = r[1] * x + r[4] * y + r[7] * z;
-            const float w = r[2] * x + r[5] * y + r[8] * z;
-            if (u < low[0] || u > high[0] || v < low[1] || v > high[1] || w < low[2] || w > high[2]) continue;
-            const float *k = m + 3 * i;
-            float *e = o + 6 * have++;
-            e[0] = u * scale, e[1] = v * scale, e[2] = w * scale;
-            for (int a = 0; a < 3; a++) e[3 + a] = r[a] * k[0] + r[3 + a] * k[1] + r[6 + a] * k[2];
+        for (int32_t start = 0; start < n && have < count; start += CHUNK) {
+            const int32_t here = n - start < CHUNK ? n - start : CHUNK;
+            uint8_t inside[CHUNK] = {0};
+            for (int32_t i = 0; i < here; i++) {
+                const float dx = x[start + i] - c[0], dy = y[start + i] - c[1], dz = z[start + i] - c[2];
+                const float u = r[0] * dx + r[3] * dy + r[6] * dz;
+                const float v = r[1] * dx + r[4] * dy + r[7] * dz;
+                const float w = r[2] * dx + r[5] * dy + r[8] * dz;
+                inside[i] = (u >= low[0]) & (u <= high[0]) & (v >= low[1]) & (v <= high[1]) & (w >= low[2]) & (w <= high[2]);
+            }
+            for (int32_t i = 0; i < here && have < count; i++) {
+                uint64_t eight;
+                if (i % 8 == 0 && (memcpy(&eight, inside + i, 8), eight == 0)) i += 7;
+                else if (inside[i]) {
+                    const float *t = p + 3 * (start + i), *s = m + 3 * (start + i);
+                    const float d[3] = {t[0] - c[0], t[1] - c[1], t[2] - c[2]};
+                    float *e = o + 6 * have++;
+                    for (int a = 0; a < 3; a++) {
+                        e[a] = (r[a] * d[0] + r[3 + a] * d[1] + r[6 + a] * d[2]) * scale;
+                        e[3 + a] = r[a] * s[0] + r[3 + a] * s[1] + r[6 + a] * s[2];
+                    }
+                }
+            }
         }
-        found[q] = have;
         if (have == 0) memset(o, 0, sizeof(float) * 6 * count);
         else
-            for (int32_t i = have; i < count; i++) memcpy(o + 6 * i, o + 6 * (i % have), sizeof(float) * 6);
+            for (int32_t i = have; i < count; i++) memcpy(o + 6 * i, o + 6 * (i - have), sizeof(float) * 6);
     }
+    free(x);
     return 0;
 }
 
-/* Heat of every vote's voxel, whether a hotter (or as hot and earlier) vote lies within `window` voxels, and the
- * heat-weighted mean of the votes in the 3x3x3 voxels around it. One sample of m votes. */
-int heatmap(const float *votes, int32_t m, float voxel, int32_t window, float center, float side, float tie, float *heat,
-            float *beaten, float *mean) {
-    int32_t *v = malloc(sizeof(int32_t) * 3 * (size_t)m);
-    if (!v) return 1;
-    const float weights[4] = {center, center * side, center * side * side, center * side * side * side};
-    for (int32_t i = 0; i < 3 * m; i++) v[i] = (int32_t)floorf(votes[i] / voxel);
+#define LANES 16
+#define BEYOND (1 << 30) /* the voxel of votes that are none */
+
+typedef float many __attribute__((vector_size(4 * LANES), aligned(4)));
+typedef int32_t whole __attribute__((vector_size(4 * LANES), aligned(4)));
+
+static inline whole apart(const int32_t *a, int32_t b) {
+    const whole d = *(const whole *)a - b, negative = d >> 31;
+    return (d ^ negative) - negative;
+}
+
+static float total(const many *v) {
+    float sum = 0;
+    for (int l = 0; l < LANES; l++) sum += (*v)[l];
+    return sum;
+}
+
+/* One sample: heat of every vote's voxel and the heat-weighted mean of the votes in the 3x3x3 voxels around it. */
+static void warm(const float *const p[3], int32_t *const v[3], int32_t m, const float weights[4], float *heat, float *mean) {
+    whole bits[4];
+    for (int n = 0; n < 4; n++) bits[n] = (whole)((many){0} + weights[n]);
     for (int32_t i = 0; i < m; i++) {
-        float sum = 0, s[3] = {0, 0, 0};
-        for (int32_t j = 0; j < m; j++) {
-            const int32_t x = abs(v[3 * i] - v[3 * j]), y = abs(v[3 * i + 1] - v[3 * j + 1]), z = abs(v[3 * i + 2] - v[3 * j + 2]);
-            if ((x | y | z) > 1) continue;
-            const float w = weights[x + y + z];
+        many sum = {0}, s[3] = {{0}, {0}, {0}};
+        for (int32_t j = 0; j < m; j += LANES) {
+            const whole x = apart(v[0] + j, v[0][i]), y = apart(v[1] + j, v[1][i]), z = apart(v[2] + j, v[2][i]);
+            const whole n = x + y + z, near = (x | y | z) < 2;
+            const whole of = ((n == 0) & bits[0]) | ((n == 1) & bits[1]) | ((n == 2) & bits[2]) | ((n == 3) & bits[3]);
+            const many w = (many)(near & of);
             sum += w;
-            for (int a = 0; a < 3; a++) s[a] += w * (votes[3 * j + a] - votes[3 * i + a]);
+            for (int a = 0; a < 3; a++) s[a] += w * (*(const many *)(p[a] + j) - p[a][i]);
         }
-        heat[i] = sum;
-        for (int a = 0; a < 3; a++) mean[3 * i + a] = votes[3 * i + a] + s[a] / sum;
+        heat[i] = total(&sum);
+        for (int a = 0; a < 3; a++) mean[3 * i + a] = p[a][i] + total(s + a) / heat[i];
     }
+}
+
+/* One sample: 1 for a vote that has a hotter one (or as hot and earlier) within `window` voxels. */
+static void beat(const float *heat, int32_t *const v[3], int32_t m, int32_t window, float tie, float *beaten) {
+    whole lane;
+    for (int l = 0; l < LANES; l++) lane[l] = l;
     for (int32_t i = 0; i < m; i++) {
-        beaten[i] = 0;
-        for (int32_t j = 0; j < m; j++) {
-            if (abs(v[3 * i] - v[3 * j]) > window || abs(v[3 * i + 1] - v[3 * j + 1]) > window || abs(v[3 * i + 2] - v[3 * j + 2]) > window) continue;
-            const float ahead = heat[j] - heat[i];
-            if (ahead > tie || (ahead >= -tie && j < i)) beaten[i] = 1;
+        whole any = {0};
+        for (int32_t j = 0; j < m; j += LANES) {
+            const whole x = apart(v[0] + j, v[0][i]), y = apart(v[1] + j, v[1][i]), z = apart(v[2] + j, v[2][i]);
+            const many ahead = *(const many *)(heat + j) - heat[i];
+            any |= (x <= window) & (y <= window) & (z <= window) & ((ahead > tie) | ((ahead >= -tie) & (lane + j < i)));
         }
+        int32_t found = 0;
+        for (int l = 0; l < LANES; l++) found |= any[l];
+        beaten[i] = found ? 1.0f : 0.0f;
     }
-    free(v);
+}
+
+/* Samples from..to of m votes each: heat, beaten (1 or 0) and mean of every vote, as in `warm` and `beat`. */
+int heatmap(const float *votes, int64_t from, int64_t to, int32_t m, float voxel, int32_t window, float center, float side,
+            float tie, float *heat, float *beaten, float *mean) {
+    const size_t padded = ((size_t)m + LANES - 1) / LANES * LANES;
+    const float weights[4] = {center, center * side, center * side * side, center * side * side * side};
+    float *memory = malloc(sizeof(float) * 7 * padded);
+    if (!memory) return 1;
+    float *p[3] = {memory, memory + padded, memory + 2 * padded}, *hot = memory + 3 * padded;
+    int32_t *v[3];
+    for (int a = 0; a < 3; a++) v[a] = (int32_t *)(hot + (size_t)(1 + a) * padded);
+    for (int64_t s = from; s < to; s++) {
+        const float *of = votes + 3 * m * s;
+        for (size_t i = 0; i < padded; i++)
+            for (int a = 0; a < 3; a++) {
+                p[a][i] = i < (size_t)m ? of[3 * i + a] : 0.0f;
+                v[a][i] = i < (size_t)m ? (int32_t)floorf(p[a][i] / voxel) : BEYOND;
+            }
+        memset(hot, 0, sizeof(float) * padded);
+        warm((const float *const *)p, v, m, weights, hot, mean + 3 * m * s);
+        beat(hot, v, m, window, tie, beaten + m * s);
+        memcpy(heat + m * s, hot, sizeof(float) * m);
+    }
+    free(memory);
     return 0;
 }

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from attentionvote.geometry import native
+from attentionvote.model.row_threads import in_threads
 
 CHANNELS = 10
 TINY = 1e-6  # the exporter deletes additions below 1e-8
@@ -57,7 +58,10 @@ def pair_features(
     arrays: list[np.ndarray] = [
         t.detach().contiguous().numpy() for t in (points, normals, centers, center_normals, index.long())
     ]
-    native.call(
-        library.pair_features, *arrays, *map(native.long, (0, len(centers))), index.shape[1], float(radius), out.numpy()
-    )
+    sizes = index.shape[1], float(radius)
+
+    def work(_: int, *rows: int) -> None:
+        native.call(library.pair_features, *arrays, *map(native.long, rows), *sizes, out.numpy())
+
+    in_threads(len(centers), work)
     return out

@@ -10,8 +10,6 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -21,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.geometry import native
+from attentionvote.model.row_threads import in_threads, thread_count
 
 MOST_NEIGHBORS = 256  # the winner of a maximum is kept in a byte
 MOST_LAYERS = 9  # as many as the kernel has pointers for
@@ -82,7 +81,7 @@ def pooled_mlp_weights(channels: int, widths: Sequence[int]) -> nn.ParameterList
 
 
 def _kernels() -> ctypes.CDLL | None:
-    return native.load("attentionvote.model", "network_ops.c", tuned=True)
+    return native.load("attentionvote.model", "pooled_mlp.c", tuned=True)
 
 
 class _PooledMLP(torch.autograd.Function):
@@ -96,7 +95,7 @@ class _PooledMLP(torch.autograd.Function):
         arguments = _arguments(geometry, projected, index, weights)
         library = _kernels()
         assert library is not None
-        _in_threads(
+        in_threads(
             centers,
             lambda _, a, b: native.call(library.pooled_forward, *arguments(a, b), out.numpy(), winner.numpy()),
         )
@@ -112,7 +111,7 @@ class _PooledMLP(torch.autograd.Function):
         assert library is not None
         transposed = _Pointers([w.detach().contiguous() for w in weights[0::2]])
         partial: list[tuple[list[Tensor], Tensor | None]] = []
-        for _ in range(_thread_count(len(geometry))):
+        for _ in range(thread_count(len(geometry))):
             # Narrow inputs: the first layer's gradient is gathered as (in, out) rows.
             sums = [torch.zeros(w.shape if i else w.T.shape) for i, w in enumerate(weights)]
             partial.append((sums, None if projected is None else torch.zeros_like(projected)))
@@ -130,7 +129,7 @@ class _PooledMLP(torch.autograd.Function):
                 None if grad_projected is None else grad_projected.numpy(),
             )
 
-        _in_threads(len(geometry), run)
+        in_threads(len(geometry), run)
         sums, grad_projected = partial[0]
         for more, more_projected in partial[1:]:
             for total, part in zip(sums, more, strict=True):
@@ -167,23 +166,3 @@ def _arguments(
 
     arguments.keep = rows, biases  # type: ignore[attr-defined]
     return arguments
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(thread_name_prefix="pooled_mlp")
-
-
-def _thread_count(rows: int) -> int:
-    return max(1, min(torch.get_num_threads(), rows // 64))
-
-
-def _in_threads(rows: int, work: Callable[[int, int, int], None]) -> None:
-    """``work(thread, start, stop)`` over equal shares of the rows, on as many threads as torch uses."""
-    threads = _thread_count(rows)
-    bounds = [rows * i // threads for i in range(threads + 1)]
-    shares = list(zip(range(threads), bounds, bounds[1:], strict=False))
-    rest = [_pool().submit(work, *share) for share in shares[1:]]
-    work(*shares[0])
-    for future in rest:
-        future.result()

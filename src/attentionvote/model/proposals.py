@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from attentionvote.geometry import native
 from attentionvote.model.precision import full_precision
+from attentionvote.model.row_threads import in_threads
 
 # The paper's kernel: 3x3x3, sigma one voxel, sum one: centre 0.0923, face 0.0560, edge 0.0339, corner 0.0206.
 SIDE = math.exp(-0.5)
@@ -106,9 +107,13 @@ class Heatmap(nn.Module):
             return heatmap_reference(votes, voxel_size, window)
         batch, count, _ = votes.shape
         heat, beaten, mean = torch.empty(batch, count), torch.empty(batch, count), torch.empty(batch, count, 3)
-        for one, *out in zip(votes.detach().contiguous(), heat, beaten, mean, strict=True):
-            arrays = [t.numpy() for t in out]
-            native.call(library.heatmap, one.numpy(), count, float(voxel_size), window, CENTER, SIDE, TIE, *arrays)
+        given, out = votes.detach().contiguous().numpy(), [t.numpy() for t in (heat, beaten, mean)]
+        settings = float(voxel_size), window, CENTER, SIDE, TIE
+
+        def work(_: int, *samples: int) -> None:
+            native.call(library.heatmap, given, *map(native.long, samples), count, *settings, *out)
+
+        in_threads(batch, work, least=1)
         return heat, beaten, mean
 
 

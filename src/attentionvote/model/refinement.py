@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -24,6 +23,7 @@ from attentionvote.model.layers import RowNorm, shared_mlp
 from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_weights
 from attentionvote.model.precision import full_precision, widened
 from attentionvote.model.rotation import matrix_from_six
+from attentionvote.model.row_threads import in_threads
 
 CHANNELS = 6
 
@@ -83,15 +83,16 @@ def points_in_box(
     if library is None:
         return points_in_box_reference(points, normals, sample, center, rotation, box, scale, count)
     out = torch.empty(len(center), count, CHANNELS)
-    found = np.empty(len(center), dtype=np.int32)
     p, m, s, c, r, b = (
         t.detach().contiguous().numpy() for t in (points, normals, sample.long(), center, rotation, box)
     )
-    rows = map(native.long, (0, len(center)))
-    corners = b[0], b[1]
-    native.call(
-        library.points_in_box, p, m, points.shape[1], s, c, r, *rows, *corners, float(scale), count, out.numpy(), found
-    )
+    settings = b[0], b[1], float(scale), count
+
+    def work(_: int, *rows: int) -> None:
+        size, ends = points.shape[1], map(native.long, rows)
+        native.call(library.points_in_box, p, m, size, s, c, r, *ends, *settings, out.numpy())
+
+    in_threads(len(center), work, least=1)
     return out
 
 
