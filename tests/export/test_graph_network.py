@@ -15,18 +15,26 @@ from attentionvote.contract import ModelCard
 from attentionvote.export.graph_network import ExportNetwork
 from attentionvote.inference.runtime import Session
 from attentionvote.model import AttentionVote, Predictions
-from attentionvote.model.backbone import SetAbstraction
-from attentionvote.model.refinement import Refiner
+from attentionvote.model.layers import RowNorm
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def test_the_given_network_is_not_changed_and_shares_its_weights(network: AttentionVote) -> None:
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    kinds = [type(module) for module in network.modules()]
     twin = ExportNetwork(network).model
-    assert all(isinstance(layer, SetAbstraction) for layer in network.backbone.abstractions)
-    assert all(isinstance(layer, Refiner) for layer in network.refiners)
-    theirs = {p.data_ptr() for p in network.parameters()}
-    assert {p.data_ptr() for p in twin.parameters()} == theirs
+    assert [type(module) for module in network.modules()] == kinds
+    after = network.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    shared = {p.data_ptr() for p in network.parameters()} & {p.data_ptr() for p in twin.parameters()}
+    assert {w.data_ptr() for layer in network.backbone.abstractions for w in layer.weights} <= shared
+
+
+@pytest.mark.slow
+def test_no_norm_is_left(network: AttentionVote, graph: bytes) -> None:
+    assert not any(isinstance(module, RowNorm) for module in ExportNetwork(network).modules())
+    assert not any(node.op_type == "BatchNormalization" for node in onnx.load(io.BytesIO(graph)).graph.node)
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +76,9 @@ def test_poor_clouds_are_answered_alike_and_finitely(
 
 @pytest.mark.slow
 def test_the_graph_has_no_loose_ends(graph: bytes) -> None:
-    """Weights lie inside, nothing points at this machine, and loops are Scans (a Loop would carry its own counter)."""
+    """Weights lie inside, and nothing points at this machine."""
     model = onnx.load(io.BytesIO(graph))
     assert not any(t.data_location == onnx.TensorProto.EXTERNAL for t in model.graph.initializer)
-    assert {n.op_type for n in model.graph.node} >= {"Scan", "TopK", "Gemm"}
+    assert {n.op_type for n in model.graph.node} >= {"Loop", "Scan", "TopK", "Gemm"}
     assert b".py" not in graph
     assert b"site-packages" not in graph

@@ -9,15 +9,15 @@ import onnx_ir as ir
 
 from attentionvote.export.graph_operators import FLOAT, constant
 
-NOWHERE = float(2**24)  # label of a place that repeats another point; beyond every index that float32 can tell apart
+NOWHERE = float(2**24)  # label of a spare place; float32 can tell all numbers below apart
 
 
 class Blocks(NamedTuple):
     """Points in blocks.
 
     Args:
-        indices: ``(blocks, size)`` int64, of the points. The last ones repeat a point where the blocks have more places.
-        label: the same as float32, but ``NOWHERE`` at repetitions.
+        indices: ``(blocks, size)`` int64, of the points; spare places repeat one.
+        label: the same as float32, but ``NOWHERE`` at spare places.
         points: ``(3, blocks, size)``.
         low, high: ``(3, 1, blocks)`` corners of their boxes.
         shape: blocks and places in each.

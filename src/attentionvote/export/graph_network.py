@@ -7,39 +7,46 @@ another order is replaced, layer by layer (``graph_layers``).
 from __future__ import annotations
 
 import copy
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from attentionvote.export.graph_layers import GraphFarthestVotes, GraphHeatmap, GraphRefiner, GraphSetAbstraction
+from attentionvote.export import graph_layers
+from attentionvote.export.graph_folding import GraphNorm, GraphVoteBranch, folded
 from attentionvote.export.graph_neighbors import find_neighborhoods
 from attentionvote.model import AttentionVote, Predictions
-from attentionvote.model.backbone import SetAbstraction
+from attentionvote.model.backbone import FeaturePropagation, SetAbstraction
+from attentionvote.model.farthest_votes import FarthestVotes
+from attentionvote.model.fusion import VoteBranch
+from attentionvote.model.layers import RowNorm
+from attentionvote.model.proposals import Heatmap
 from attentionvote.model.refinement import Refiner
 
-Kind = TypeVar("Kind", bound=nn.Module)
+_LAYERS: dict[type[nn.Module], Callable[[Any], nn.Module]] = {
+    RowNorm: GraphNorm,
+    nn.Sequential: folded,
+    VoteBranch: GraphVoteBranch,
+    SetAbstraction: graph_layers.GraphSetAbstraction,
+    FeaturePropagation: graph_layers.GraphFeaturePropagation,
+    Refiner: graph_layers.GraphRefiner,
+    FarthestVotes: lambda _: graph_layers.GraphFarthestVotes(),
+    Heatmap: lambda _: graph_layers.GraphHeatmap(),
+}
 
 
 class ExportNetwork(nn.Module):
     """Points and normals in, poses out, nothing else needed: ``AttentionVote`` for a batch of one.
 
     Args:
-        model: a trained network; its weights are shared, it is not changed.
+        model: a trained network; it is not changed, and its weights are shared but for those that take up a norm.
     """
 
     def __init__(self, model: AttentionVote) -> None:
         super().__init__()
-        model = _shallow(model)
-        model.backbone = _shallow(model.backbone)
-        model.backbone.abstractions = nn.ModuleList(
-            GraphSetAbstraction(layer) for layer in _layers(model.backbone.abstractions, SetAbstraction)
-        )
-        model.refiners = nn.ModuleList(GraphRefiner(layer) for layer in _layers(model.refiners, Refiner))
-        if model.farthest is not None:
-            model.farthest = GraphFarthestVotes()
-        model.heatmap = GraphHeatmap()
-        self.model = model.eval()
+        shared = {id(tensor): tensor for tensor in (*model.parameters(), *model.buffers())}
+        self.model = _replaced(copy.deepcopy(model, shared).eval())
 
     def forward(self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"]) -> Predictions:
         """What ``AttentionVote.forward`` answers for the same cloud."""
@@ -47,13 +54,9 @@ class ExportNetwork(nn.Module):
         return predictions
 
 
-def _layers(modules: nn.ModuleList, kind: type[Kind]) -> list[Kind]:
-    """The modules of a list, which are all of one kind."""
-    return [module for module in modules if isinstance(module, kind)]
-
-
-def _shallow(module: Kind) -> Kind:
-    """A module with the same weights whose children can be replaced without the original noticing."""
-    twin = copy.copy(module)
-    twin._modules = dict(module._modules)
-    return twin
+def _replaced(module: nn.Module) -> Any:
+    """What stands for a module whose own layers are replaced first."""
+    for name, child in list(module.named_children()):
+        setattr(module, name, _replaced(child))
+    stands_for = _LAYERS.get(type(module))
+    return stands_for(module) if stands_for else module
