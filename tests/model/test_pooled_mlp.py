@@ -96,6 +96,22 @@ def test_repeated_neighbours_change_nothing() -> None:
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("first_only", [False, True], ids=["in turn", "the first"])
+@pytest.mark.parametrize("distinct", [1, 3, 8, 13])
+@pytest.mark.parametrize("other", [None, 13, 15])
+def test_what_repeats_is_left_out_and_nothing_else(distinct: int, first_only: bool, other: int | None) -> None:
+    """A ball with fewer points than places; ``other``: one place that is another neighbour after all."""
+    geometry, projected, index, weights = arguments(6, 16, 10, (32, 64))
+    place = torch.arange(16) % distinct if not first_only else torch.arange(16) * (torch.arange(16) < distinct)
+    geometry, index = geometry[:, place].contiguous(), index[:, place].contiguous()
+    if other is not None:
+        geometry[::2, other] += 1  # another place
+        index[1::2, other] = (index[1::2, other] + 1) % 6  # the same place, other features
+    actual, expected = (run(f, geometry, projected, index, weights) for f in (pooled_mlp, pooled_mlp_reference))
+    for a, b in zip(actual, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
 @pytest.fixture
 def three_threads() -> Iterator[None]:
     before = torch.get_num_threads()

@@ -1,12 +1,12 @@
 /* The arithmetic of a set abstraction on a CPU: shared MLP over the neighbours of a centre, then the maximum.
  *
- * Everything of one centre stays in the first-level cache; the backward pass recomputes the hidden layers and uses
- * that the maximum hands its gradient to one neighbour a channel, so the widest layer costs almost nothing there.
- * Called through ctypes by model/pooled_mlp.py, whose reference formulation is the oracle of the tests. Weights of
- * layer l: forward takes them as (in, out) rows, backward also as (out, in). All widths are multiples of 8. Where the
- * processor has AVX-512, whole tiles are of 16 numbers; every number stays the same sum in the same order.
+ * Everything of one centre stays in the first-level cache; the backward pass recomputes the hidden layers. Neighbours
+ * that only repeat earlier ones (a ball with fewer points than places) are left out, and in the backward pass all that
+ * are no channel's maximum: they get no gradient. Called through ctypes by model/pooled_mlp.py, whose reference
+ * formulation is the oracle of the tests. Weights of layer l: forward takes them as (in, out) rows, backward also as
+ * (out, in). All widths are multiples of 8. Where the processor has AVX-512, whole tiles are of 16 numbers; every
+ * number stays the same sum in the same order.
  */
-#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -24,47 +24,61 @@ typedef float v16 __attribute__((vector_size(64), aligned(4)));
 typedef int32_t i16 __attribute__((vector_size(64)));
 #define WIDE_ROWS 8
 #define WIDE_COLUMNS 32
+#define INLINE static inline __attribute__((always_inline))
 
-/* linear for whole tiles of 8 rows and 32 columns; every number is the same sum in the same order. */
-static void linear_wide(const float *in, int rows, int n_in, const float *weights, const float *bias, int n_out,
-                        float *out, int relu) {
-    for (int o = 0; o < n_out; o += WIDE_COLUMNS)
-        for (int r = 0; r < rows; r += WIDE_ROWS) {
-            const float *x = in + (int64_t)r * n_in, *w = weights + o;
-            v16 a[WIDE_ROWS], b[WIDE_ROWS];
-            for (int j = 0; j < WIDE_ROWS; j++)
-                a[j] = *(const v16 *)(bias + o), b[j] = *(const v16 *)(bias + o + 16);
-            for (int i = 0; i < n_in; i++, w += n_out) {
-                const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
-                for (int j = 0; j < WIDE_ROWS; j++) {
-                    const float v = x[(int64_t)j * n_in + i];
-                    a[j] += v * w0, b[j] += v * w1;
-                }
-            }
-            float *y = out + (int64_t)r * n_out + o;
-            for (int j = 0; j < WIDE_ROWS; j++, y += n_out) {
-                if (relu) a[j] = (v16)((a[j] > (v16){0}) & (i16)a[j]), b[j] = (v16)((b[j] > (v16){0}) & (i16)b[j]);
-                *(v16 *)y = a[j], *(v16 *)(y + 16) = b[j];
-            }
+/* `height` rows (a constant) and 32 columns of linear. */
+INLINE void linear_tile(const float *x, int n_in, const float *w, const float *bias, int n_out, float *y, int relu,
+                        const int height) {
+    v16 a[WIDE_ROWS], b[WIDE_ROWS];
+    for (int j = 0; j < height; j++) a[j] = *(const v16 *)bias, b[j] = *(const v16 *)(bias + 16);
+    for (int i = 0; i < n_in; i++, w += n_out) {
+        const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
+        for (int j = 0; j < height; j++) {
+            const float v = x[(int64_t)j * n_in + i];
+            a[j] += v * w0, b[j] += v * w1;
         }
+    }
+    for (int j = 0; j < height; j++, y += n_out) {
+        if (relu) a[j] = (v16)((a[j] > (v16){0}) & (i16)a[j]), b[j] = (v16)((b[j] > (v16){0}) & (i16)b[j]);
+        *(v16 *)y = a[j], *(v16 *)(y + 16) = b[j];
+    }
 }
 
-/* sums[n_left][n_right] += transpose(left[rows][n_left]) * right[rows][n_right], in tiles as above. */
+/* linear for a multiple of 4 rows and of 32 columns. */
+static void linear_wide(const float *in, int rows, int n_in, const float *weights, const float *bias, int n_out,
+                        float *out, int relu) {
+    for (int o = 0; o < n_out; o += WIDE_COLUMNS) {
+        int r = 0;
+        for (; r + 8 <= rows; r += 8)
+            linear_tile(in + (int64_t)r * n_in, n_in, weights + o, bias + o, n_out, out + (int64_t)r * n_out + o, relu, 8);
+        if (r < rows)
+            linear_tile(in + (int64_t)r * n_in, n_in, weights + o, bias + o, n_out, out + (int64_t)r * n_out + o, relu, 4);
+    }
+}
+
+/* `height` rows (a constant) and 32 columns of outer_wide. */
+INLINE void outer_tile(const float *x, int n_left, const float *w, int n_right, int rows, float *sums, const int height) {
+    v16 a[WIDE_ROWS], b[WIDE_ROWS];
+    for (int j = 0; j < height; j++)
+        a[j] = *(const v16 *)(sums + (int64_t)j * n_right), b[j] = *(const v16 *)(sums + (int64_t)j * n_right + 16);
+    for (int r = 0; r < rows; r++, x += n_left, w += n_right) {
+        const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
+        for (int j = 0; j < height; j++) a[j] += x[j] * w0, b[j] += x[j] * w1;
+    }
+    for (int j = 0; j < height; j++)
+        *(v16 *)(sums + (int64_t)j * n_right) = a[j], *(v16 *)(sums + (int64_t)j * n_right + 16) = b[j];
+}
+
+/* sums[n_left][n_right] += transpose(left[rows][n_left]) * right[rows][n_right], n_right a multiple of 32. */
 static void outer_wide(const float *left, int n_left, const float *right, int n_right, int rows, float *sums) {
-    for (int i = 0; i < n_left; i += WIDE_ROWS)
-        for (int o = 0; o < n_right; o += WIDE_COLUMNS) {
-            v16 a[WIDE_ROWS], b[WIDE_ROWS];
-            float *y = sums + (int64_t)i * n_right + o;
-            for (int j = 0; j < WIDE_ROWS; j++)
-                a[j] = *(const v16 *)(y + (int64_t)j * n_right), b[j] = *(const v16 *)(y + (int64_t)j * n_right + 16);
-            for (int r = 0; r < rows; r++) {
-                const float *x = left + (int64_t)r * n_left + i, *w = right + (int64_t)r * n_right + o;
-                const v16 w0 = *(const v16 *)w, w1 = *(const v16 *)(w + 16);
-                for (int j = 0; j < WIDE_ROWS; j++) a[j] += x[j] * w0, b[j] += x[j] * w1;
-            }
-            for (int j = 0; j < WIDE_ROWS; j++)
-                *(v16 *)(y + (int64_t)j * n_right) = a[j], *(v16 *)(y + (int64_t)j * n_right + 16) = b[j];
-        }
+    for (int o = 0; o < n_right; o += WIDE_COLUMNS) {
+        int i = 0;
+        for (; i + 8 <= n_left; i += 8)
+            outer_tile(left + i, n_left, right + o, n_right, rows, sums + (int64_t)i * n_right + o, 8);
+        for (; i + 2 <= n_left; i += 2)
+            outer_tile(left + i, n_left, right + o, n_right, rows, sums + (int64_t)i * n_right + o, 2);
+        if (i < n_left) outer_tile(left + i, n_left, right + o, n_right, rows, sums + (int64_t)i * n_right + o, 1);
+    }
 }
 #endif
 
@@ -72,7 +86,7 @@ static void outer_wide(const float *left, int n_left, const float *right, int n_
 static void linear(const float *in, int rows, int n_in, const float *weights, const float *bias, int n_out, float *out,
                    int relu) {
 #ifdef __AVX512F__
-    if (rows % WIDE_ROWS == 0 && n_out % WIDE_COLUMNS == 0) {
+    if (rows % 4 == 0 && n_out % WIDE_COLUMNS == 0) {
         linear_wide(in, rows, n_in, weights, bias, n_out, out, relu);
         return;
     }
@@ -125,10 +139,45 @@ static void axpy(float a, const float *x, float *y, int n) {
     for (int i = 0; i < n; i += 8) V(y + i) += a * C(x + i);
 }
 
-/* A gradient behind a ReLU, which is added to the bias's. */
-static void gated(float *gradient, const float *hidden, int n, float *grad_bias) {
-    for (int i = 0; i < n; i++) gradient[i] = hidden[i] > 0.0f ? gradient[i] : 0.0f;
-    for (int i = 0; i < n; i += 8) V(grad_bias + i) += C(gradient + i);
+/* sums[n_left][n_right] += transpose(left[rows][n_left]) * right[rows][n_right]. */
+static void outer(const float *left, int n_left, const float *right, int n_right, int rows, float *sums) {
+#ifdef __AVX512F__
+    if (n_right % WIDE_COLUMNS == 0) {
+        outer_wide(left, n_left, right, n_right, rows, sums);
+        return;
+    }
+#endif
+    for (int r = 0; r < rows; r++, left += n_left, right += n_right)
+        for (int i = 0; i < n_left; i++)
+            if (left[i] != 0.0f) axpy(left[i], right, sums + (int64_t)i * n_right, n_right);
+}
+
+/* Gradients behind a ReLU, which are added to the bias's. */
+static void gated(float *gradients, const float *hidden, int rows, int width, float *grad_bias) {
+    for (int i = 0; i < width; i += 8) {
+        v8 sum = C(grad_bias + i);
+        for (int64_t at = i; at < (int64_t)rows * width; at += width) {
+            const v8 g = (v8)((C(hidden + at) > (v8){0}) & (i8)C(gradients + at));
+            V(gradients + at) = g, sum += g;
+        }
+        V(grad_bias + i) = sum;
+    }
+}
+
+/* How many neighbours have to be looked at: those from h on repeat the first h in turn, or the first one. A few more,
+ * if there are any, so that they fill tiles. */
+static int different(const float *geometry, int k, int channels, const int64_t *index) {
+    const size_t size = sizeof(float) * (size_t)channels;
+    int h = 0;
+    for (int j = 1; j < k; j++) {
+        const float *row = geometry + (int64_t)j * channels;
+        const int first = (!index || index[j] == index[0]) && memcmp(row, geometry, size) == 0;
+        if (!h && first) h = j;
+        else if (h && !first && !((!index || index[j] == index[j - h]) && memcmp(row, row - (int64_t)h * channels, size) == 0))
+            return k;
+    }
+    const int rows = (h + 3) / 4 * 4;
+    return h && rows < k ? rows : k;
 }
 
 /* Hidden layers of one centre: hidden[l] for l < layers - 1. The first adds the projected features of the level below. */
@@ -160,14 +209,16 @@ int pooled_forward(const float *geometry, int64_t from, int64_t to, int32_t k, i
     float *next = memory + (size_t)k * top;
     for (int l = 0; l < layers - 1; next += (size_t)k * widths[l], l++) hidden[l] = next;
     for (int64_t c = from; c < to; c++) {
-        hidden_layers(geometry + c * k * channels, k, channels, projected, index ? index + c * k : NULL, layers, widths,
-                      weights, biases, hidden);
-        linear(hidden[layers - 2], k, widths[layers - 2], weights[layers - 1], biases[layers - 1], top, last, 0);
+        const float *g = geometry + c * k * channels;
+        const int64_t *at = projected ? index + c * k : NULL;
+        const int rows = different(g, k, channels, at);
+        hidden_layers(g, rows, channels, projected, at, layers, widths, weights, biases, hidden);
+        linear(hidden[layers - 2], rows, widths[layers - 2], weights[layers - 1], biases[layers - 1], top, last, 0);
         float *o = out + c * top;
         uint8_t *win = winner + c * top;
         memcpy(o, last, sizeof(float) * top);
         memset(win, 0, top);
-        for (int j = 1; j < k; j++) {
+        for (int j = 1; j < rows; j++) {
             const float *row = last + (int64_t)j * top;
             for (int i = 0; i < top; i++) {
                 win[i] = row[i] > o[i] ? (uint8_t)j : win[i];
@@ -186,68 +237,64 @@ int pooled_backward(const float *geometry, int64_t from, int64_t to, int32_t k, 
                     const float *grad_out, float *const *grad_weights, float *const *grad_biases,
                     float *grad_projected) {
     float *hidden[8], *grads[8];
-    const int top = widths[layers - 1], n = layers - 1;
-    size_t total = 0, widest = 0;
+    const int top = widths[layers - 1], n = layers - 1, room = (k + 3) / 4 * 4;
+    size_t total = (size_t)room * channels, widest = 0;
     for (int l = 0; l < n; l++) {
-        total += 2 * (size_t)k * widths[l];
+        total += 2 * (size_t)room * widths[l];
         widest = (size_t)widths[l] > widest ? (size_t)widths[l] : widest;
     }
     float *memory = malloc(sizeof(float) * total), *none = calloc(widest, sizeof(float)); /* no bias */
-    uint8_t *touched = malloc((size_t)k);
-    if (!memory || !touched || !none) {
-        free(memory), free(touched), free(none);
+    int64_t *source = malloc(sizeof(int64_t) * room);
+    int *place = malloc(sizeof(int) * k);
+    if (!memory || !none || !source || !place) {
+        free(memory), free(none), free(source), free(place);
         return 1;
     }
-    float *next = memory;
-    for (int l = 0; l < n; next += 2 * (size_t)k * widths[l], l++)
-        hidden[l] = next, grads[l] = next + (size_t)k * widths[l];
+    float *packed = memory, *next = memory + (size_t)room * channels;
+    for (int l = 0; l < n; next += 2 * (size_t)room * widths[l], l++)
+        hidden[l] = next, grads[l] = next + (size_t)room * widths[l];
     for (int64_t c = from; c < to; c++) {
         const float *g = geometry + c * k * channels, *grad = grad_out + c * top;
         const uint8_t *win = winner + c * top;
-        hidden_layers(g, k, channels, projected, index ? index + c * k : NULL, layers, widths, weights, biases, hidden);
-        memset(touched, 0, (size_t)k);
-        memset(grads[n - 1], 0, sizeof(float) * (size_t)k * widths[n - 1]);
+        const int under_top = widths[n - 1];
+        /* The neighbours that get a gradient, in their order, and as many without one as fill the last tile. */
+        memset(place, 0, sizeof(int) * k);
+        for (int i = 0; i < top; i++) place[win[i]] |= grad[i] != 0.0f;
+        int rows = 0;
+        for (int j = 0; j < k; j++) {
+            if (!place[j]) continue;
+            memcpy(packed + (int64_t)rows * channels, g + (int64_t)j * channels, sizeof(float) * channels);
+            source[rows] = projected ? index[c * k + j] : 0;
+            place[j] = rows++;
+        }
+        if (rows == 0) continue;
+        const int touched = rows;
+        for (; rows % 4; rows++) {
+            memcpy(packed + (int64_t)rows * channels, packed, sizeof(float) * channels);
+            source[rows] = source[0];
+        }
+        hidden_layers(packed, rows, channels, projected, source, layers, widths, weights, biases, hidden);
+        memset(grads[n - 1], 0, sizeof(float) * (size_t)rows * under_top);
         for (int i = 0; i < top; i++) {
-            const int64_t w = win[i];
             if (grad[i] == 0.0f) continue;
-            touched[w] = 1;
-            axpy(grad[i], hidden[n - 1] + w * widths[n - 1], grad_weights[n] + (int64_t)i * widths[n - 1], widths[n - 1]);
-            axpy(grad[i], transposed[n] + (int64_t)i * widths[n - 1], grads[n - 1] + w * widths[n - 1], widths[n - 1]);
+            const int64_t w = place[win[i]] * under_top;
+            axpy(grad[i], hidden[n - 1] + w, grad_weights[n] + (int64_t)i * under_top, under_top);
+            axpy(grad[i], transposed[n] + (int64_t)i * under_top, grads[n - 1] + w, under_top);
             grad_biases[n][i] += grad[i];
         }
-        int first = n - 1; /* the highest layer whose gradients still have to be handed down */
-#ifdef __AVX512F__
-        /* All neighbours together; the untouched ones' gradients are zero. */
-        for (; first > 0 && k % WIDE_ROWS == 0 && widths[first - 1] % WIDE_COLUMNS == 0; first--) {
-            const int width = widths[first], under = widths[first - 1];
-            for (int64_t j = 0; j < k; j++)
-                gated(grads[first] + j * width, hidden[first] + j * width, width, grad_biases[first]);
-            outer_wide(grads[first], width, hidden[first - 1], under, k, grad_weights[first]);
-            linear_wide(grads[first], k, width, transposed[first], none, under, grads[first - 1], 0);
-        }
-#endif
-        for (int j = 0; j < k; j++) {
-            if (!touched[j]) continue;
-            for (int l = first; l >= 0; l--) {
-                const int width = widths[l];
-                float *gh = grads[l] + (int64_t)j * width;
-                gated(gh, hidden[l] + (int64_t)j * width, width, grad_biases[l]);
-                if (l == 0) break;
-                const float *below = hidden[l - 1] + (int64_t)j * widths[l - 1];
-                float *gb = grads[l - 1] + (int64_t)j * widths[l - 1];
-                memset(gb, 0, sizeof(float) * widths[l - 1]);
-                for (int i = 0; i < width; i++) {
-                    if (gh[i] == 0.0f) continue;
-                    axpy(gh[i], below, grad_weights[l] + (int64_t)i * widths[l - 1], widths[l - 1]);
-                    axpy(gh[i], transposed[l] + (int64_t)i * widths[l - 1], gb, widths[l - 1]);
-                }
-            }
-            const float *gh = grads[0] + (int64_t)j * widths[0];
-            if (grad_projected) axpy(1.0f, gh, grad_projected + index[c * k + j] * widths[0], widths[0]);
+        for (int l = n - 1; l >= 0; l--) {
+            const int width = widths[l], under = l ? widths[l - 1] : channels;
+            gated(grads[l], hidden[l], rows, width, grad_biases[l]);
             /* The first layer's gradient is kept as (in, out): its input is narrower than a vector. */
-            for (int i = 0; i < channels; i++) axpy(g[(int64_t)j * channels + i], gh, grad_weights[0] + (int64_t)i * widths[0], widths[0]);
+            if (l == 0) outer(packed, under, grads[0], width, rows, grad_weights[0]);
+            else {
+                outer(grads[l], width, hidden[l - 1], under, rows, grad_weights[l]);
+                linear(grads[l], rows, width, transposed[l], none, under, grads[l - 1], 0);
+            }
         }
+        for (int j = 0; grad_projected && j < touched; j++)
+            axpy(1.0f, grads[0] + (int64_t)j * widths[0], grad_projected + source[j] * widths[0], widths[0]);
     }
-    free(memory), free(touched), free(none);
+    free(memory), free(none), free(source), free(place);
     return 0;
 }
