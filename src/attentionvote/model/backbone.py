@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from attentionvote.model.interpolation import interpolate
 from attentionvote.model.layers import Residual, RowNorm, shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods
 from attentionvote.model.point_features import CHANNELS, pair_features
@@ -78,9 +79,7 @@ class FeaturePropagation(nn.Module):
         weights: Float[Tensor, "batch fine 3"],
     ) -> Float[Tensor, "batch fine out"]:
         """Features at the fine level."""
-        batch = torch.arange(len(coarse), device=coarse.device)[:, None, None]
-        interpolated = (coarse[batch, nearest] * weights[..., None]).sum(-2)
-        out: Tensor = self.mlp(torch.cat([interpolated, fine], dim=-1))
+        out: Tensor = self.mlp(interpolate(coarse, fine, nearest, weights))
         return out
 
 

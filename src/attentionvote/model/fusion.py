@@ -16,6 +16,7 @@ from typing import Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import embedding  # a lookup; its gradient costs a third of an index's
 
 from attentionvote.model.layers import RowNorm, shared_mlp
 
@@ -43,7 +44,7 @@ class VoteBranch(nn.Module):
         index: Int[Tensor, "rows gathered"],
     ) -> Float[Tensor, "rows gathered out"]:
         """Features of the gathered votes; ``index`` are rows of ``features``."""
-        out: Tensor = self.rest(self.offset(offsets) + self.project(features)[index])
+        out: Tensor = self.rest(self.offset(offsets) + embedding(index, self.project(features)))
         return out
 
 
@@ -96,7 +97,7 @@ class MatrixAttention(nn.Module):
         index: Int[Tensor, "rows gathered"],
     ) -> Float[Tensor, "rows out"]:
         """Proposal features; ``offsets`` are (vote - centre seed) / voting radius."""
-        weight = self.weight_of_offset(offsets) + self.weight_of_feature(features)[index]
+        weight = self.weight_of_offset(offsets) + embedding(index, self.weight_of_feature(features))
         return (torch.softmax(weight, dim=1) * self.feature(offsets, features, index)).sum(1)
 
 

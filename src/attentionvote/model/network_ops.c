@@ -1,8 +1,8 @@
-/* The small functions of the network on a CPU: what a centre is told about its neighbours, the points in a part's box,
- * and the heatmap of the votes.
+/* The small functions of the network on a CPU: what a centre is told about its neighbours, features between centres,
+ * the points in a part's box, and the heatmap of the votes.
  *
- * Called through ctypes by model/point_features.py, refinement.py and proposals.py, whose reference formulations are
- * the oracles of the tests. Numbers that belong together are laid out one kind after the other, so that the compiler
+ * Called through ctypes by model/point_features.py, interpolation.py, refinement.py and proposals.py, whose reference
+ * formulations are the oracles of the tests. Numbers that belong together are laid out one kind after the other, so that the compiler
  * computes as many at once as the processor can. Each works on rows from..to, so that threads can share them.
  */
 #include <math.h>
@@ -32,6 +32,37 @@ int pair_features(const float *points, const float *normals, const float *center
             o[8] = (n[0] * x + n[1] * y + n[2] * z) * s;
             o[9] = m[0] * n[0] + m[1] * n[1] + m[2] * n[2];
         }
+    }
+    return 0;
+}
+
+/* Samples from..to: out[fine][width + own] of every fine point, the weighted sum of the features of its three nearest
+ * coarse ones and its own features behind it. An index is within its sample. */
+int interpolate(const float *coarse, const float *fine, const int64_t *nearest, const float *weights, int64_t from,
+                int64_t to, int32_t below, int32_t rows, int32_t width, int32_t own, float *out) {
+    for (int64_t r = from * rows; r < to * rows; r++) {
+        const float *features = coarse + r / rows * below * width, *w = weights + 3 * r;
+        const float *a = features + nearest[3 * r] * width, *b = features + nearest[3 * r + 1] * width;
+        const float *c = features + nearest[3 * r + 2] * width;
+        float *o = out + r * (width + own);
+        for (int32_t i = 0; i < width; i++) o[i] = a[i] * w[0] + b[i] * w[1] + c[i] * w[2];
+        memcpy(o + width, fine + r * own, sizeof(float) * own);
+    }
+    return 0;
+}
+
+/* The gradients of both inputs, given that of `out`. */
+int interpolate_backward(const float *grad, const int64_t *nearest, const float *weights, int64_t from, int64_t to,
+                         int32_t below, int32_t rows, int32_t width, int32_t own, float *grad_coarse, float *grad_fine) {
+    memset(grad_coarse + from * below * width, 0, sizeof(float) * (size_t)((to - from) * below * width));
+    for (int64_t r = from * rows; r < to * rows; r++) {
+        const float *g = grad + r * (width + own);
+        for (int k = 0; k < 3; k++) {
+            float *sum = grad_coarse + (r / rows * below + nearest[3 * r + k]) * width;
+            const float w = weights[3 * r + k];
+            for (int32_t i = 0; i < width; i++) sum[i] += w * g[i];
+        }
+        memcpy(grad_fine + r * own, g + width, sizeof(float) * own);
     }
     return 0;
 }

@@ -1,0 +1,85 @@
+"""Features of a finer level from the three nearest centres of a coarser one, its own features beside them."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from attentionvote.geometry import native
+from attentionvote.model.row_threads import in_threads
+
+
+def interpolate_reference(
+    coarse: Float[Tensor, "batch coarse channels"],
+    fine: Float[Tensor, "batch fine own"],
+    nearest: Int[Tensor, "batch fine 3"],
+    weights: Float[Tensor, "batch fine 3"],
+) -> Float[Tensor, "batch fine both"]:
+    """Weighted sum of the features of each fine point's three nearest coarse ones (PointNet++), then its own features.
+
+    Args:
+        coarse: features of the coarser level.
+        fine: own features of the finer level.
+        nearest: rows of ``coarse``, within the sample.
+        weights: of the three, sum one.
+    """
+    batch, rows, channels = coarse.shape
+    index = nearest + torch.arange(batch, device=coarse.device)[:, None, None] * rows
+    # One table of rows: the gradient of a lookup in it costs a third of that of an index by sample and row.
+    gathered = torch.nn.functional.embedding(index, coarse.reshape(-1, channels))
+    return torch.cat([(gathered * weights[..., None]).sum(-2), fine], dim=-1)
+
+
+def interpolate(
+    coarse: Float[Tensor, "batch coarse channels"],
+    fine: Float[Tensor, "batch fine own"],
+    nearest: Int[Tensor, "batch fine 3"],
+    weights: Float[Tensor, "batch fine 3"],
+) -> Float[Tensor, "batch fine both"]:
+    """``interpolate_reference`` by the fastest means at hand; ``weights`` get no gradient."""
+    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (coarse, fine, weights))
+    library = _kernels() if plain and not torch.compiler.is_compiling() else None
+    if library is None:
+        return interpolate_reference(coarse, fine, nearest, weights)
+    result: Tensor = _Interpolate.apply(coarse, fine, nearest.long(), weights.detach())
+    return result
+
+
+def _kernels() -> ctypes.CDLL | None:
+    return native.load("attentionvote.model", "network_ops.c", tuned=True)
+
+
+class _Interpolate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, coarse: Tensor, fine: Tensor, nearest: Tensor, weights: Tensor) -> Tensor:
+        coarse, fine, nearest, weights = (t.contiguous() for t in (coarse, fine, nearest, weights))
+        ctx.sizes = coarse.shape[1], fine.shape[1], coarse.shape[2], fine.shape[2]
+        out = coarse.new_empty(*fine.shape[:2], coarse.shape[2] + fine.shape[2])
+        given, library = [t.numpy() for t in (coarse, fine, nearest, weights)], _kernels()
+        assert library is not None
+
+        def work(_: int, *samples: int) -> None:
+            native.call(library.interpolate, *given, *map(native.long, samples), *ctx.sizes, out.numpy())
+
+        in_threads(len(coarse), work, least=1)
+        ctx.save_for_backward(nearest, weights)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        nearest, weights = ctx.saved_tensors
+        batch, (below, rows, width, own) = len(weights), ctx.sizes
+        grad_coarse, grad_fine = weights.new_empty(batch, below, width), weights.new_empty(batch, rows, own)
+        given = [t.numpy() for t in (gradients[0].contiguous(), nearest, weights)]
+        out, library = [t.numpy() for t in (grad_coarse, grad_fine)], _kernels()
+        assert library is not None
+
+        def work(_: int, *samples: int) -> None:
+            native.call(library.interpolate_backward, *given, *map(native.long, samples), *ctx.sizes, *out)
+
+        in_threads(batch, work, least=1)
+        return grad_coarse, grad_fine, None, None
