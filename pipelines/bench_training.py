@@ -109,7 +109,7 @@ def step(material: Material, size: str) -> Contest:
         model = copy.deepcopy(material.network(size)).train()
         kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[cfg.trainer.optimizer]
         # A rate of 0: every round is the same step.
-        optimizer = kind(model.parameters(), lr=0.0, foreach=True)
+        optimizer = kind(model.parameters(), lr=0.0, fused=True)
 
         def run() -> Answer:
             optimizer.zero_grad()

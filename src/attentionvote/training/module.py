@@ -115,7 +115,9 @@ class PoseTraining(L.LightningModule):
         plain = [p for p in self.parameters() if p.ndim <= 1]
         groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": plain, "weight_decay": 0.0}]
         kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.optimizer]
-        optimizer = kind(groups, lr=self.learning_rate, foreach=True)
+        # One pass over each weight instead of ten; Lightning clips no gradients of such an optimizer in mixed precision.
+        fused = str(self.trainer.precision).endswith("-true")
+        optimizer = kind(groups, lr=self.learning_rate, foreach=not fused, fused=fused)
         total = int(self.trainer.estimated_stepping_batches)
         per_epoch = max(1, int(self.trainer.num_training_batches))
         factor = self.schedule.rate_factor(total, per_epoch)
