@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply, inverse
 from attentionvote.part import Parts
 from attentionvote.simulation.camera import Camera
+from attentionvote.simulation.ray_selection import FirstHits, Windows
 
 Floats = NDArray[np.float64]
 
@@ -127,28 +129,18 @@ class PartCaster:
         Raises:
             ValueError: when an instance reaches behind the origin.
         """
-        # Sorted by x, the rays that can meet an instance are a slice, then a comparison in y.
-        order = np.argsort(xy[:, 0])
-        rays = np.ones((len(xy), 3), dtype=np.float32)
-        rays[:, :2] = xy[order]
-        x, y = xy[order, 0], xy[order, 1]
-        nearest = np.full(len(xy), np.inf, dtype=np.float32)
-        owner = np.full(len(xy), -1, dtype=np.int32)
-        face = np.zeros(len(xy), dtype=np.int32)
         kinds = _kinds(part_ids, len(camera_from_part))
-        low, high = self._outline_boxes(camera_from_part, kinds)
-        first, last = np.searchsorted(x, low[:, 0], "left"), np.searchsorted(x, high[:, 0], "right")
-        for i, pose in enumerate(camera_from_part):
-            inside = y[first[i] : last[i]]
-            chosen = np.flatnonzero((inside >= low[i, 1]) & (inside <= high[i, 1])) + first[i]
-            t, primitive = self._cast_one(kinds[i], pose, rays[chosen])
-            closer = (primitive >= 0) & (t < nearest[chosen])
-            chosen = chosen[closer]
-            nearest[chosen], owner[chosen], face[chosen] = t[closer], i, primitive[closer]
+        windows, hits = self._windows(camera_from_part, kinds), FirstHits(xy)
+        first, last = hits.slices(windows)
+        # What lies nearer hides rays from the rest.
+        for i in np.argsort(windows.near, kind="stable"):
+            chosen, rays = hits.select(windows, i, first[i], last[i])
+            hits.keep(chosen, *self._cast_one(kinds[i], camera_from_part[i], rays), i)
         depth, instance = np.full(len(xy), np.inf), np.full(len(xy), -1, dtype=np.int32)
         normal = np.zeros((len(xy), 3))
-        hit = np.flatnonzero(owner >= 0)
-        ray, t, owner, face = order[hit], nearest[hit].astype(np.float64), owner[hit], face[hit]
+        hit = np.flatnonzero(hits.owner >= 0)
+        ray, t = hits.order[hit], hits.nearest[hit].astype(np.float64)
+        owner, face = hits.owner[hit], hits.face[hit]
         if surface is not None:
             wall = np.full(len(xy), np.inf)
             wanted = slice(None) if background else ray
@@ -195,7 +187,8 @@ class PartCaster:
         """
         count = len(camera_from_part)
         kinds = _kinds(part_ids, count)
-        low, high = self._outline_boxes(camera_from_part, kinds)
+        windows = self._windows(camera_from_part, kinds)
+        low, high = windows.low, windows.high
         centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
         size = np.array([camera.width, camera.height])
         first = np.ceil((low * focal + centre) / stride).astype(int)
@@ -213,10 +206,8 @@ class PartCaster:
             rays = np.ones((height, width, 3), dtype=np.float32)
             rays[..., 0] = (np.arange(u, u + width) * stride - centre[0]) / focal[0]
             rays[..., 1] = ((np.arange(v, v + height) * stride - centre[1]) / focal[1])[:, None]
-            t, face = self._cast_one(kinds[i], pose, rays.reshape(-1, 3))
-            t[face < 0] = np.inf
-            silhouette[i] = (face >= 0).sum()
-            (column, row), depth = (u, v) - origin, t.reshape(height, width)
+            depth, silhouette[i] = self._depth(kinds[i], pose, rays, windows, i)
+            column, row = (u, v) - origin
             window = slice(row, row + height), slice(column, column + width)
             closer = depth < nearest[window]
             np.copyto(nearest[window], depth, where=closer)
@@ -234,7 +225,7 @@ class PartCaster:
         self, camera_from_part: Floats, camera: Camera, part_ids: NDArray[np.int32] | None = None
     ) -> tuple[int, int, int, int]:
         """First and last column and row, ``(u0, u1, v0, v1)`` inclusive, of the picture's part that holds the pile."""
-        low, high = self._outline_boxes(camera_from_part, _kinds(part_ids, len(camera_from_part)))
+        low, high = self._windows(camera_from_part, _kinds(part_ids, len(camera_from_part)))[:2]
         centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
         u0, v0 = np.maximum(np.ceil(low.min(axis=0) * focal + centre), 0).astype(int)
         u1, v1 = np.minimum(np.floor(high.max(axis=0) * focal + centre), (camera.width - 1, camera.height - 1)).astype(
@@ -242,17 +233,34 @@ class PartCaster:
         )
         return int(u0), int(u1), int(v0), int(v1)
 
-    def _outline_boxes(self, camera_from_part: Floats, kinds: NDArray[np.int32]) -> tuple[Floats, Floats]:
-        """Bounds ``(I, 2)``, ``(I, 2)`` of the instances' projections on the plane z = 1."""
-        low, high = np.empty((len(kinds), 2)), np.empty((len(kinds), 2))
+    def _windows(self, camera_from_part: Floats, kinds: NDArray[np.int32]) -> Windows:
+        """Where the instances are on the plane z = 1."""
+        windows = Windows.empty(len(kinds))
         for kind, part in enumerate(self.part.parts):
             own = kinds == kind
+            if not own.any():
+                continue
             outline = apply(camera_from_part[own], self._surfaces[kind].outline)
-            if len(outline) and outline[..., 2].min() <= 0:
+            if outline[..., 2].min() <= 0:
                 raise ValueError(f"{part.name}: every instance must lie in front of the camera, one reaches z <= 0")
-            projected = outline[..., :2] / outline[..., 2:]
-            low[own], high[own] = projected.min(axis=1) - 1e-9, projected.max(axis=1) + 1e-9
-        return low, high
+            windows.fill(own, outline)
+        return windows
+
+    def _depth(
+        self, kind: int, pose: Floats, rays: NDArray[np.float32], windows: Windows, i: int
+    ) -> tuple[NDArray[np.float32], int]:
+        """Depth ``(H, W)`` of instance ``i`` alone along a grid of rays ``(H, W, 3)``, inf for misses; hits."""
+        x, y = rays[0, :, 0], rays[:, 0, 1]
+        across = x * np.float32(windows.across[i, 0]) + (y * np.float32(windows.across[i, 1]))[:, None]
+        chosen = np.flatnonzero((across >= windows.low_across[i]) & (across <= windows.high_across[i]))
+        rays = rays.reshape(-1, 3)
+        if len(chosen) < 2:  # one ray is turned by another routine than many, with another rounding
+            chosen = np.arange(len(rays))
+        t, face = self._cast_one(kind, pose, rays[chosen])
+        t[face < 0] = np.inf
+        depth = np.full((len(y), len(x)), np.inf, dtype=np.float32)
+        depth.reshape(-1)[chosen] = t
+        return depth, int((face >= 0).sum())
 
     def _cast_one(
         self, kind: int, pose: Floats, rays: NDArray[np.float32]
@@ -262,8 +270,8 @@ class PartCaster:
             return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int32)
         part_from_camera = inverse(pose)
         direction = rays @ part_from_camera[:3, :3].T.astype(np.float32)
-        origin = np.empty_like(direction)
-        origin[:] = part_from_camera[:3, 3]
+        # Embree wants an origin for every ray: all are the same three numbers.
+        origin = as_strided(part_from_camera[:3, 3].astype(np.float32), direction.shape, (0, 4))
         out = self._surfaces[kind].scene.run(origin, direction, output=1)
         return out["tfar"], out["primID"]
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.scene import Scene
+from attentionvote.simulation.ray_selection import random_order
 from attentionvote.simulation.raycast import BinSurface, Floats, Hits, PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 
@@ -102,7 +103,7 @@ def synthesize(
     scanner = _Scanner(record, caster, sensor, rng) if sensor.preset == "phoxi" else None
     u0, u1, v0, v1 = caster.pixel_box(poses, record.camera, record.part_ids)
     width, height = max(u1 - u0 + 1, 0), max(v1 - v0 + 1, 0)
-    order = rng.permutation(np.arange(width * height, dtype=np.int32))
+    order = random_order(width * height, rng)
     points: list[Floats] = []
     ids: list[NDArray[np.int32]] = []
     found, used = 0, 0
@@ -149,7 +150,7 @@ class _Scanner:
         self.poses_from_projector[:, :3, 3] -= self.projector
         self.surface_from_projector: BinSurface = record.bin_surface.moved(self.projector)
 
-    def measure(self, pixels: NDArray[np.int64], hits: Hits) -> tuple[Floats, NDArray[np.int32]]:
+    def measure(self, pixels: NDArray[np.int32], hits: Hits) -> tuple[Floats, NDArray[np.int32]]:
         """Points ``(Q, 3)`` and their instances of those pixels at which the scanner measures a part."""
         sensor, rng = self.sensor, self.rng
         keep = np.flatnonzero(hits.instance >= 0)
@@ -191,7 +192,7 @@ class _Scanner:
             lost = np.maximum(lost, mirror * self.sensor.specular)
         return cosine, lost
 
-    def _edges(self, pixels: NDArray[np.int64], z: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def _edges(self, pixels: NDArray[np.int32], z: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Depth after flying pixels, and which points an edge swallows; looks at the four neighbouring pixels."""
         neighbours = (pixels[:, None] + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
         rays = self.record.camera.rays(neighbours)
