@@ -198,6 +198,13 @@ def test_weights_stored_column_by_column_give_the_same() -> None:
 def test_the_libraries_are_those_of_this_package(kernels: dict[str, ctypes.CDLL]) -> None:
     for file, names in {
         "pooled_mlp.c": ("pooled_forward", "pooled_backward"),
-        "network_ops.c": ("pair_features", "interpolate", "interpolate_backward", "points_in_box", "heatmap"),
+        "network_ops.c": (
+            "pair_features",
+            "interpolate",
+            "interpolate_backward",
+            "points_in_box",
+            "votes_around",
+            "heatmap",
+        ),
     }.items():
         assert all(hasattr(kernels[file], name) for name in names)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from attentionvote.model import proposals
-from attentionvote.model.proposals import gather_votes, heatmap_peaks, heatmap_reference
+from attentionvote.model.proposals import gather_votes, gather_votes_reference, heatmap_peaks, heatmap_reference
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
@@ -140,6 +140,7 @@ def test_peaks_do_not_depend_on_the_other_samples(seed: int) -> None:
 def test_gathered_votes_equal_a_loop(seed: int, votes: int, count: int, radius: int) -> None:
     cast, seeds = scattered(seed, votes, 3, 2), scattered(seed + 1, 5, 4, 2)
     index = gather_votes(cast, seeds, radius * VOXEL, count)
+    torch.testing.assert_close(index, gather_votes_reference(cast, seeds, radius * VOXEL, count))
     for sample in range(2):
         for row, seed_xyz in enumerate(seeds[sample].double().numpy()):
             squared = ((cast[sample].double().numpy() - seed_xyz) ** 2).sum(1)

@@ -134,7 +134,7 @@ def fit(
     trainer = L.Trainer(
         accelerator="cpu", max_epochs=epochs, logger=False, callbacks=list(callbacks), enable_progress_bar=False,
         enable_checkpointing=False, enable_model_summary=False, num_sanity_val_steps=0, precision=precision,
-        gradient_clip_val=5.0,
+        gradient_clip_val=5.0,  # a part of every training; not every optimizer allows it in every precision
     )  # fmt: skip
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*LeafSpec.*")

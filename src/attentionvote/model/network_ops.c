@@ -1,5 +1,5 @@
 /* The small functions of the network on a CPU: what a centre is told about its neighbours, features between centres,
- * the points in a part's box, and the heatmap of the votes.
+ * the points in a part's box, the votes around a seed, and the heatmap of the votes.
  *
  * Called through ctypes by model/point_features.py, interpolation.py, refinement.py and proposals.py, whose reference
  * formulations are the oracles of the tests. Numbers that belong together are laid out one kind after the other, so that the compiler
@@ -111,6 +111,36 @@ int points_in_box(const float *points, const float *normals, int32_t n, const in
         if (have == 0) memset(o, 0, sizeof(float) * 6 * count);
         else
             for (int32_t i = have; i < count; i++) memcpy(o + 6 * i, o + 6 * (i - have), sizeof(float) * 6);
+    }
+    free(x);
+    return 0;
+}
+
+/* Samples from..to: which of a sample's m votes lie within the radius of each of its seeds, the first `count` in index
+ * order, repeated in turn when there are fewer; the nearest vote when there is none. */
+int votes_around(const float *votes, const float *seeds, int64_t from, int64_t to, int32_t m, int32_t per_sample,
+                 float squared_radius, int32_t count, int64_t *out) {
+    float *x = malloc(sizeof(float) * 4 * (size_t)m), *y = x + m, *z = y + m, *squared = z + m;
+    if (!x) return 1;
+    for (int64_t s = from; s < to; s++) {
+        const float *v = votes + 3 * m * s;
+        for (int32_t i = 0; i < m; i++) x[i] = v[3 * i], y[i] = v[3 * i + 1], z[i] = v[3 * i + 2];
+        for (int64_t q = s * per_sample; q < (s + 1) * per_sample; q++) {
+            const float *p = seeds + 3 * q;
+            int64_t *o = out + q * count;
+            int32_t have = 0, nearest = 0;
+            for (int32_t i = 0; i < m; i++) {
+                const float dx = p[0] - x[i], dy = p[1] - y[i], dz = p[2] - z[i];
+                squared[i] = dx * dx + dy * dy + dz * dz;
+            }
+            for (int32_t i = 0; i < m && have < count; i++)
+                if (squared[i] <= squared_radius) o[have++] = i;
+            if (have == 0) {
+                for (int32_t i = 1; i < m; i++) nearest = squared[i] < squared[nearest] ? i : nearest;
+                o[have++] = nearest;
+            }
+            for (int32_t i = have; i < count; i++) o[i] = o[i - have];
+        }
     }
     free(x);
     return 0;

@@ -117,7 +117,7 @@ class Heatmap(nn.Module):
         return heat, beaten, mean
 
 
-def gather_votes(
+def gather_votes_reference(
     votes: Float[Tensor, "batch votes 3"],
     center_seed: Float[Tensor, "batch proposals 3"],
     radius: float,
@@ -139,3 +139,27 @@ def gather_votes(
     position = torch.arange(count, device=votes.device) % found.clamp(min=1)
     index = torch.take_along_dim(index, position, dim=-1)
     return torch.where(found > 0, index, nearest[..., None])
+
+
+def gather_votes(
+    votes: Float[Tensor, "batch votes 3"],
+    center_seed: Float[Tensor, "batch proposals 3"],
+    radius: float,
+    count: int,
+) -> Tensor:
+    """``gather_votes_reference`` by the fastest means at hand; carries no gradient."""
+    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (votes, center_seed))
+    plain = plain and not torch.compiler.is_compiling()
+    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+    if library is None:
+        return gather_votes_reference(votes, center_seed, radius, count)
+    batch, total, _ = votes.shape
+    out = torch.empty(batch, center_seed.shape[1], count, dtype=torch.long)
+    given = [t.detach().contiguous().numpy() for t in (votes, center_seed)]
+    settings = total, center_seed.shape[1], radius * radius, count
+
+    def work(_: int, *samples: int) -> None:
+        native.call(library.votes_around, *given, *map(native.long, samples), *settings, out.numpy())
+
+    in_threads(batch, work, least=1)
+    return out

@@ -115,7 +115,7 @@ class PoseTraining(L.LightningModule):
         plain = [p for p in self.parameters() if p.ndim <= 1]
         groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": plain, "weight_decay": 0.0}]
         kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.optimizer]
-        # One pass over each weight instead of ten; Lightning clips no gradients of such an optimizer in mixed precision.
+        # One pass over each weight instead of ten; in mixed precision Lightning clips no gradients of such a one.
         fused = str(self.trainer.precision).endswith("-true")
         optimizer = kind(groups, lr=self.learning_rate, foreach=not fused, fused=fused)
         total = int(self.trainer.estimated_stepping_batches)
