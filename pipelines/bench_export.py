@@ -17,17 +17,21 @@ from numpy.typing import NDArray
 from attentionvote.geometry import native
 from attentionvote.inference import PoseEstimator
 from attentionvote.inference.bundle import Bundle
-from attentionvote.inference.preparation import prepare
+from attentionvote.inference.preparation import find_neighbors, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.model import Predictions
 
 KERNELS, GIVEN = "torch with C kernels", "plain torch, neighbours given"
+CELL = "neighbours by the cell's C code, then the graph"
 MOST_MM = 0.01
 LEAST_SHARE = 0.95  # of proposals: one on the edge of a box or a ball may change sides, as make export reports
 
 
 def graph(material: Material, size: str) -> Contest:
-    """Order and neighbours found in the graph and by torch with C kernels; plain torch is given one or both."""
+    """Order and neighbours found in the graph and by torch with C kernels; plain torch is given one or both.
+
+    A cell whose image brings the C code gives them to the graph, too.
+    """
     model, batch = material.network(size), material.batch(size, 1)
     session = Session(material.graph(size), material.card(size))
     points, normals = batch.points.numpy(), batch.normals.numpy()
@@ -51,10 +55,15 @@ def graph(material: Material, size: str) -> Contest:
             answer: Predictions = model(batch.points, batch.normals, batch.found._replace(neighbors=tuple(neighbors)))
         return answer
 
-    def compare(fast: dict[str, NDArray], others: Mapping[str, Predictions]) -> str:
-        shares = []
-        for name, other in others.items():
-            apart_mm = 1e3 * np.linalg.norm(fast["center"] - other.center.numpy(), axis=-1)
+    def in_a_cell() -> dict[str, NDArray]:
+        return session.run(points, normals, found=find_neighbors(points, session.layout))
+
+    def compare(fast: dict[str, NDArray], others: Mapping[str, Any]) -> str:
+        shares, in_cell = [], others[CELL]
+        if any(not np.array_equal(value, in_cell[name]) for name, value in fast.items()):
+            raise Unequal("the graph must answer the same when it is given its neighbours, but it answers otherwise")
+        for name in (EAGER, GIVEN, KERNELS):
+            apart_mm = 1e3 * np.linalg.norm(fast["center"] - others[name].center.numpy(), axis=-1)
             share = float((apart_mm <= MOST_MM).mean())
             if share < LEAST_SHARE:
                 wanted = f"{LEAST_SHARE:.0%} of the proposals must lie within {MOST_MM} mm"
@@ -63,7 +72,9 @@ def graph(material: Material, size: str) -> Contest:
         return f"{min(shares):.0%} of the proposals within {MOST_MM} mm"
 
     text = f"{points.shape[1]:,} points"
-    references = {EAGER: slowly(finding), GIVEN: slowly(eager(True)), KERNELS: eager(False)}
+    references: dict[str, Callable[[], Any]] = {
+        EAGER: slowly(finding), GIVEN: slowly(eager(True)), KERNELS: eager(False), CELL: in_a_cell
+    }  # fmt: skip
     return Contest(lambda: session.run(points, normals), references, compare, text)
 
 

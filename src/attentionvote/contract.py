@@ -23,6 +23,10 @@ CARD_KEY = "attentionvote"  # of the card in the graph's metadata_props
 # Came later: absent where it is None, so that older cells read such cards and newer ones read old cards.
 _OPTIONAL = ("voting_radius", "parts")
 INPUTS = ("points", "normals")
+# What the graph finds itself where it is not given: which points are centres, and each level's neighbours. Their sizes
+# are a JSON object in metadata_props; a graph without it can be given nothing.
+FOUND = ("order", "neighbors_1", "neighbors_2", "neighbors_3", "neighbors_4")
+LAYOUT_KEY = "attentionvote.layout"
 
 
 class TensorSpec(NamedTuple):

@@ -11,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from attentionvote.contract import FOUND
 from attentionvote.export import graph_neighbors
-from attentionvote.export.graph_operators import OPSET, write_out
+from attentionvote.export.graph_operators import OPSET, make_optional, write_out
 from attentionvote.export.onnx_file import quiet_exporter
 from attentionvote.model import Layout
 from attentionvote.model.neighborhoods import find_neighborhoods
@@ -23,17 +24,20 @@ pytestmark = pytest.mark.slow
 
 
 class Finder(nn.Module):
-    def forward(self, points: Tensor) -> tuple[Tensor, ...]:
-        found = graph_neighbors.find_neighborhoods(points, LAYOUT)
+    def forward(self, points: Tensor, *given: Tensor) -> tuple[Tensor, ...]:
+        found = graph_neighbors.find_neighborhoods(points, LAYOUT, given)
         return (found.order, *found.neighbors, *found.nearest, *found.weights)
 
 
 @pytest.fixture(scope="module")
 def finder() -> onnxruntime.InferenceSession:
     with quiet_exporter(), torch.no_grad():
-        program = torch.onnx.export(Finder(), (torch.rand(1, COUNT, 3),), input_names=["points"], opset_version=OPSET)
+        given = (torch.zeros(shape, dtype=torch.int64) for shape in graph_neighbors.shapes_of(LAYOUT))
+        names = ["points", *FOUND]
+        program = torch.onnx.export(Finder(), (torch.rand(1, COUNT, 3), *given), input_names=names, opset_version=OPSET)
     assert program is not None
     write_out(program.model)
+    make_optional(program.model, FOUND)
     buffer = io.BytesIO()
     program.save(buffer)
     return onnxruntime.InferenceSession(buffer.getvalue(), providers=["CPUExecutionProvider"])

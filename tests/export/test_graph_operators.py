@@ -32,15 +32,16 @@ def session(
     **attributes: Any,
 ) -> onnxruntime.InferenceSession:
     """One operator as a graph."""
-    given_points = graph_operators.value("points", graph_operators.FLOAT, [points, 3])
+    inputs = [graph_operators.value("points", graph_operators.FLOAT, [points, 3])]
+    if name == "Neighborhoods":
+        inputs += [graph_operators.value(f"given_{i}", graph_operators.INT, shape) for i, shape in enumerate(shapes)]
     outputs = [graph_operators.value(f"output_{i}", graph_operators.INT, shape) for i, shape in enumerate(shapes)]
     convert = ir.convenience.convert_attributes(attributes)
-    node = ir.Node("attentionvote", name, [given_points], attributes=convert, outputs=outputs)
-    graph = ir.Graph(
-        [given_points], outputs, nodes=[node], opset_imports={"": graph_operators.OPSET, "attentionvote": 1}
-    )
+    node = ir.Node("attentionvote", name, inputs, attributes=convert, outputs=outputs)
+    graph = ir.Graph(inputs, outputs, nodes=[node], opset_imports={"": graph_operators.OPSET, "attentionvote": 1})
     model = ir.Model(graph, ir_version=10)
     graph_operators.write_out(model)
+    graph_operators.make_optional(model, [given.name for given in inputs[1:] if given.name])
     assert {n.domain for n in model.graph} == {""}
     return onnxruntime.InferenceSession(ir.to_proto(model).SerializeToString(), options)
 

@@ -12,7 +12,7 @@ import pytest
 from onnx import TensorProto, helper
 
 import attentionvote
-from attentionvote.contract import CARD_KEY, ModelCard, TensorSpec
+from attentionvote.contract import CARD_KEY, LAYOUT_KEY, ModelCard, TensorSpec
 from attentionvote.export.onnx_file import OPSET, check_graph
 from attentionvote.model import AttentionVote
 
@@ -29,7 +29,7 @@ def test_the_same_weights_give_the_same_bytes_from_another_checkout(
 @pytest.mark.slow
 def test_the_graph_carries_its_card_without_what_is_measured_on_it(graph: bytes, card: ModelCard) -> None:
     model = onnx.load_from_string(graph)
-    assert [p.key for p in model.metadata_props] == [CARD_KEY]
+    assert [p.key for p in model.metadata_props] == [CARD_KEY, LAYOUT_KEY]
     inside = ModelCard.from_json(model.metadata_props[0].value)
     assert inside == card.core()
     assert inside.evaluation == {}

@@ -11,11 +11,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
+from attentionvote.geometry import native
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.geometry.pose import rotation_about, transform
+from attentionvote.geometry.sampling import farthest_point_order
 from attentionvote.inference.depth_files import CameraIntrinsics, read_depth
 from attentionvote.inference.errors import InputError
-from attentionvote.inference.preparation import Crop, TooFewPoints, checked_cloud, fewest_points, prepare
+from attentionvote.inference.preparation import (
+    Crop,
+    TooFewPoints,
+    checked_cloud,
+    fewest_points,
+    find_neighbors,
+    prepare,
+)
 
 MakeCard = Callable[..., ModelCard]
 MakeCloud = Callable[..., NDArray[np.float32]]
@@ -29,6 +38,19 @@ def overhead(height: float = 0.85, size: tuple[float, float, float] = (0.3, 0.2,
 def rows(cloud: NDArray) -> set[bytes]:
     """Points as a set."""
     return {row.tobytes() for row in np.ascontiguousarray(cloud.reshape(-1, 3))}
+
+
+LAYOUT = {"centers": [40, 20, 10, 5], "neighbors": [8, 6, 4, 2], "radii": [0.02, 0.04, 0.06, 0.12]}
+
+
+def test_neighbours_are_found_by_c_code_or_not_at_all(make_cloud: MakeCloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = make_cloud(300)[None]
+    order, *neighbors = find_neighbors(points, LAYOUT)
+    np.testing.assert_array_equal(order, farthest_point_order(points[0], 40))
+    assert [one.shape for one in neighbors] == [(40, 8), (20, 6), (10, 4), (5, 2)]
+    assert find_neighbors(points, None) == []  # a graph of an earlier version
+    monkeypatch.setattr(native, "load", lambda *_, **__: None)  # a cell compiles nothing
+    assert find_neighbors(points, LAYOUT) == []
 
 
 def test_inputs_are_points_of_the_cloud_with_the_dense_clouds_normals(

@@ -7,6 +7,7 @@ outside of a trace the operators answer zeros.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import onnx_ir as ir
@@ -17,7 +18,7 @@ from torch import Tensor
 from attentionvote.export.graph_ball_query import ball_query
 from attentionvote.export.graph_blocks import in_blocks
 from attentionvote.export.graph_farthest_points import farthest_points
-from attentionvote.export.graph_operators import operator, traced_operator
+from attentionvote.export.graph_operators import INT, constant, inner, operator, traced_operator, value
 from attentionvote.model import Layout, Neighborhoods
 
 _SMALL, _LARGE, _MANY = 32, 64, 8192  # points a block, and of how many points on blocks are large: measured
@@ -28,11 +29,24 @@ def farthest_point_order(points: Float[Tensor, "points 3"], count: int) -> Int[T
     return traced_operator("FarthestPoints", [points], {"count": count}, [[count]])[0]
 
 
-def find_neighborhoods(points: Float[Tensor, "1 points 3"], layout: Layout) -> Neighborhoods:
-    """``model.neighborhoods.find_neighborhoods`` of a batch of one, in standard operators."""
-    cloud, shapes = points[0], list(zip(layout.centers, layout.neighbors, strict=True))
+def shapes_of(layout: Layout) -> list[tuple[int, ...]]:
+    """Of the farthest-point order and the four lists of neighbours."""
+    return [layout.centers[:1], *zip(layout.centers, layout.neighbors, strict=True)]
+
+
+def find_neighborhoods(
+    points: Float[Tensor, "1 points 3"], layout: Layout, given: Sequence[Int[Tensor, "*sizes"]]
+) -> Neighborhoods:
+    """``model.neighborhoods.find_neighborhoods`` of a batch of one, in standard operators.
+
+    Args:
+        points: metres.
+        layout: the levels.
+        given: order and neighbours, taken as they are; found where they are empty.
+    """
+    cloud = points[0]
     sizes = {"centers": layout.centers, "neighbors": layout.neighbors, "radii": layout.radii}
-    order, *neighbors = traced_operator("Neighborhoods", [cloud], sizes, [layout.centers[:1], *shapes])
+    order, *neighbors = traced_operator("Neighborhoods", [cloud, *given], sizes, shapes_of(layout))
     ordered = cloud[order]
     pairs = ((layout.centers[3], layout.centers[2]), (layout.centers[2], layout.centers[1]))
     found = [three_nearest(ordered[:coarse], ordered[:fine]) for coarse, fine in pairs]
@@ -63,8 +77,28 @@ def _farthest_points(op: Any, points: ir.Value, count: int) -> ir.Value:
 
 @operator("Neighborhoods")
 def _neighborhoods(
-    op: Any, points: ir.Value, centers: list[int], neighbors: list[int], radii: list[float]
+    op: Any, points: ir.Value, *given: ir.Value, centers: list[int], neighbors: list[int], radii: list[float]
 ) -> list[ir.Value]:
+    shapes = [centers[:1], *([size, count] for size, count in zip(centers, neighbors, strict=True))]
+
+    def spaces(name: str) -> list[ir.Value]:
+        return [value(f"{name}_{level}", INT, shape) for level, shape in enumerate(shapes)]
+
+    def take(op: Any) -> list[ir.Value]:
+        return [op.Reshape(one, shape) for one, shape in zip(given, shapes, strict=True)]
+
+    def find(op: Any) -> list[ir.Value]:
+        return _found(op, points, centers, neighbors, radii)
+
+    nothing = op.Equal(op.Size(given[0]), constant(op, 0))
+    branches = {
+        "then_branch": inner(op, "find", find, [], spaces("found")),
+        "else_branch": inner(op, "take", take, [], spaces("taken")),
+    }
+    return list(op.If(nothing, **branches, _outputs=len(shapes)))
+
+
+def _found(op: Any, points: ir.Value, centers: list[int], neighbors: list[int], radii: list[float]) -> list[ir.Value]:
     below, number = op.Transpose(points, perm=[1, 0]), _number(points)
     blocks = in_blocks(op, below, number, max(_block(number), neighbors[0]))
     order = farthest_points(op, below, blocks, number, centers[0])

@@ -10,7 +10,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.export import graph_layers
@@ -48,9 +48,11 @@ class ExportNetwork(nn.Module):
         shared = {id(tensor): tensor for tensor in (*model.parameters(), *model.buffers())}
         self.model = _replaced(copy.deepcopy(model, shared).eval())
 
-    def forward(self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"]) -> Predictions:
-        """What ``AttentionVote.forward`` answers for the same cloud."""
-        predictions: Predictions = self.model(points, normals, find_neighborhoods(points, self.model.layout))
+    def forward(
+        self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"], *given: Int[Tensor, "*sizes"]
+    ) -> Predictions:
+        """What ``AttentionVote.forward`` answers for the same cloud; ``given``: see ``find_neighborhoods``."""
+        predictions: Predictions = self.model(points, normals, find_neighborhoods(points, self.model.layout, given))
         return predictions
 
 

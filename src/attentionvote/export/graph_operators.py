@@ -78,6 +78,17 @@ def write_out(model: ir.Model) -> None:
     model.opset_imports.pop(_DOMAIN, None)
 
 
+def make_optional(model: ir.Model, names: Sequence[str]) -> None:
+    """Give inputs a default that is empty along their first dimension: a run may leave them out."""
+    for given in model.graph.inputs:
+        if given.name in names:
+            assert given.shape is not None
+            rest = [length for length in given.shape[1:] if isinstance(length, int)]
+            given.shape = ir.Shape([f"{given.name}_length", *rest])
+            given.const_value = ir.tensor(np.zeros([0, *rest], np.int64), name=given.name)
+            model.graph.register_initializer(given)
+
+
 def constant(op: Any, values: ArrayLike) -> ir.Value:
     """A tensor that is known now."""
     value: ir.Value = op.Constant(value=ir.tensor(np.asarray(values)))

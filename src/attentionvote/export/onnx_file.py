@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import gc
+import json
 import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 
 import numpy as np
 import onnx
 import torch
 
-from attentionvote.contract import CARD_KEY, INPUTS, ModelCard, TensorSpec
+from attentionvote.contract import CARD_KEY, FOUND, INPUTS, LAYOUT_KEY, ModelCard, TensorSpec
+from attentionvote.export.graph_neighbors import shapes_of
 from attentionvote.export.graph_network import ExportNetwork
-from attentionvote.export.graph_operators import OPSET, write_out
+from attentionvote.export.graph_operators import OPSET, make_optional, write_out
 from attentionvote.model import AttentionVote, Predictions
 
 
@@ -31,23 +34,26 @@ def export_graph(model: AttentionVote, card: ModelCard) -> bytes:
     Raises:
         ValueError: when the graph does not come out as the card and the contract say.
     """
-    points, normals = _example(card.points)
+    example = (*_example(card.points), *(torch.zeros(shape, dtype=torch.int64) for shape in shapes_of(model.layout)))
     with quiet_exporter(), uncollected(), torch.no_grad():
-        traced = torch.export.export(ExportNetwork(model).eval(), (points, normals), strict=False)
+        # Not strict: that refuses calls of operators by name.
+        traced = torch.export.export(ExportNetwork(model).eval(), example, strict=False)
         program = torch.onnx.export(
             traced,
             dynamo=True,
             opset_version=OPSET,
-            input_names=list(INPUTS),
+            input_names=[*INPUTS, *FOUND],
             output_names=list(Predictions._fields),
             verbose=False,
         )
     assert program is not None
     write_out(program.model)
+    make_optional(program.model, FOUND)
     graph = program.model_proto
     _strip(graph.graph)
     del graph.metadata_props[:]
     graph.metadata_props.add(key=CARD_KEY, value=card.core().to_json())
+    graph.metadata_props.add(key=LAYOUT_KEY, value=json.dumps(asdict(model.layout)))
     check_graph(graph, card)
     return graph.SerializeToString(deterministic=True)
 
@@ -65,8 +71,9 @@ def check_graph(graph: onnx.ModelProto, card: ModelCard) -> None:
     foreign = sorted({node.domain for node in _nodes(graph.graph)} - {""}) + [f.name for f in graph.functions]
     if foreign:
         raise ValueError(f"the exported graph must consist of standard operators, got {', '.join(foreign)}")
+    optional = {initializer.name for initializer in graph.graph.initializer}
     for kind, expected, actual in (
-        ("inputs", card.inputs, graph.graph.input),
+        ("inputs", card.inputs, [value for value in graph.graph.input if value.name not in optional]),
         ("outputs", card.outputs, graph.graph.output),
     ):
         found = tuple(_spec(value) for value in actual)

@@ -7,6 +7,8 @@ tests and takes its place where no compiler is found. Both return the same indic
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,6 +72,26 @@ def ball_query(
     found = np.empty(len(middle), dtype=np.int32)
     native.call(library.ball_query, xyz, len(xyz), middle, len(middle), float(radius), count, neighbors, found)
     return neighbors.astype(np.int64), found.astype(np.int64)
+
+
+def level_neighbors(
+    points: NDArray[np.float32], centers: Sequence[int], neighbors: Sequence[int], radii: Sequence[float]
+) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+    """The farthest-point order ``(S1,)`` of a sample, and the neighbours ``(S_l, k_l)`` of every level's centres.
+
+    A level's centres are the first S_l of the order. Its neighbours are indices into the centres of the level below,
+    the first level's into the points.
+
+    Args:
+        points: ``(N, 3)`` metres in random order, at least ``centers[0]``.
+        centers, neighbors, radii: S_l, k_l and metres by level.
+    """
+    order = farthest_point_order(points, centers[0])
+    ordered, below, found = points[order], points, []
+    for size, count, radius in zip(centers, neighbors, radii, strict=True):
+        found.append(ball_query(below, ordered[:size], radius, count)[0])
+        below = ordered[:size]
+    return order, found
 
 
 def three_nearest(

@@ -15,7 +15,7 @@ from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection,
 from attentionvote.inference.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.depth_files import CameraIntrinsics
 from attentionvote.inference.errors import DeadlineExceeded, InputError
-from attentionvote.inference.preparation import Crop, Prepared, TooFewPoints, prepare
+from attentionvote.inference.preparation import Crop, Prepared, TooFewPoints, find_neighbors, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.inference.signature import PUBLIC_NAME, keys_folder
 
@@ -123,7 +123,8 @@ class PoseEstimator:
             prepared = _prepared(cloud, self.card, crop, clock, depth is not None)
             facts |= {"points_used": prepared.used, "warnings": prepared.warnings}
             clock.lap("prepare")
-            outputs = session.run(prepared.points, prepared.normals, clock.left())
+            neighbors = find_neighbors(prepared.points, session.layout)
+            outputs = session.run(prepared.points, prepared.normals, clock.left(), neighbors)
             clock.lap("graph")
         except TooFewPoints as error:
             facts |= {"points_used": error.used, "seconds": clock.seconds()}

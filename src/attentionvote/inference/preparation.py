@@ -6,7 +6,7 @@ have a fixed seed, so the same cloud gives the same inputs, bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
+from attentionvote.geometry import native
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.geometry.pose import apply, inverse
+from attentionvote.geometry.sampling import level_neighbors
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scale_check import check_scene, check_unit
 
@@ -111,6 +113,19 @@ class Prepared(NamedTuple):
     given: int
     used: int
     warnings: tuple[str, ...]
+
+
+def find_neighbors(points: NDArray[np.float32], layout: Mapping[str, Any] | None) -> list[NDArray[np.int64]]:
+    """What the graph need not find itself: the C code does in a tenth of the time; nothing where there is none.
+
+    Args:
+        points: ``(1, N, 3)`` of the graph's input.
+        layout: see ``Session``.
+    """
+    if layout is None or native.load("attentionvote.geometry", "pointops.c", make=False) is None:
+        return []
+    order, neighbors = level_neighbors(points[0], **layout)
+    return [order, *neighbors]
 
 
 def fewest_points(card: ModelCard) -> int:

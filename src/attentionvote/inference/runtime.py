@@ -6,9 +6,12 @@ onnxruntime's Linux wheels write a device id and a data base below the home dire
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 import time
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +20,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
 import onnxruntime  # type: ignore[import-untyped]
 
-from attentionvote.contract import ModelCard, TensorSpec
+from attentionvote.contract import FOUND, LAYOUT_KEY, ModelCard, TensorSpec
 from attentionvote.inference.errors import BundleError, DeadlineExceeded
 
 __all__ = ["DeadlineExceeded", "Session", "providers", "runtime_version"]
@@ -44,6 +47,9 @@ def runtime_version() -> str:
 
 class Session:
     """A loaded graph that fits its card. Runs may overlap: the session holds no state of a run.
+
+    Attributes:
+        layout: centers, neighbors and radii by level of what ``run`` may be given; None: a graph of an earlier version.
 
     Args:
         model: the ONNX file.
@@ -78,30 +84,39 @@ class Session:
             raise BundleError(f"onnxruntime must run the graph with {provider}, but here it falls back to {used}")
         _check_tensors("input", self._session.get_inputs(), card.inputs)
         _check_tensors("output", self._session.get_outputs(), card.outputs)
+        optional = {node.name for node in self._session.get_overridable_initializers()}
+        said = self._session.get_modelmeta().custom_metadata_map.get(LAYOUT_KEY)
+        self.layout: dict[str, Any] | None = json.loads(said) if said and optional >= set(FOUND) else None
         self._inputs = card.inputs
         self._outputs = [spec.name for spec in card.outputs]
 
     def run(
-        self, points: NDArray[np.float32], normals: NDArray[np.float32], deadline_s: float | None = None
+        self,
+        points: NDArray[np.float32],
+        normals: NDArray[np.float32],
+        deadline_s: float | None = None,
+        found: Sequence[NDArray[np.int64]] = (),
     ) -> dict[str, NDArray[np.float32]]:
         """The graph's outputs by name.
 
         Args:
             points, normals: ``(1, N, 3)`` float32.
             deadline_s: seconds from now; the graph is stopped when they have passed. None: it runs to its end.
+            found: farthest-point order and neighbours as ``layout`` says; the graph finds them where there are none.
 
         Raises:
             ValueError: when an input has another shape or type.
             DeadlineExceeded: when there was no answer in time; the work has ended, nothing goes on in the background.
             RuntimeError: when onnxruntime fails.
         """
-        feed = dict(zip((spec.name for spec in self._inputs), (points, normals), strict=True))
+        feed: dict[str, NDArray[Any]] = dict(zip((spec.name for spec in self._inputs), (points, normals), strict=True))
         for spec in self._inputs:
             array = feed[spec.name]
             if array.shape != spec.shape or array.dtype != np.float32:
                 raise ValueError(
                     f"{spec.name} must be float32 of shape {spec.shape}, got {array.dtype} of shape {array.shape}"
                 )
+        feed |= dict(zip(FOUND, found, strict=False))
         start = time.monotonic()
         if deadline_s is not None and not deadline_s > 0:
             raise DeadlineExceeded("the deadline had passed before the graph was started")

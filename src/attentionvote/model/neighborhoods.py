@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from attentionvote.geometry.sampling import ball_query, farthest_point_order, three_nearest
+from attentionvote.geometry.sampling import level_neighbors, three_nearest
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,8 @@ def find_neighborhoods(points: NDArray[np.float32], layout: Layout) -> Neighborh
     """
     if len(points) < layout.centers[0]:
         raise ValueError(f"a sample must have at least {layout.centers[0]} points (first level), got {len(points)}")
-    order = farthest_point_order(points, layout.centers[0])
-    ordered = points[order]
-    below, neighbors = points, []
-    for size, count, radius in zip(layout.centers, layout.neighbors, layout.radii, strict=True):
-        neighbors.append(ball_query(below, ordered[:size], radius, count)[0])
-        below = ordered[:size]
-    nearest, weights = [], []
+    order, neighbors = level_neighbors(points, layout.centers, layout.neighbors, layout.radii)
+    ordered, nearest, weights = points[order], [], []
     for coarse, fine in ((layout.centers[3], layout.centers[2]), (layout.centers[2], layout.centers[1])):
         index, distance = three_nearest(ordered[:coarse], ordered[:fine])
         weight = 1.0 / (distance.astype(np.float64) ** 2 + 1e-10)  # PointNet++; metres
