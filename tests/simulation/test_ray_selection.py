@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from attentionvote.geometry import native
+from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.simulation import PartCaster
 from attentionvote.simulation.ray_selection import FirstHits, Windows, random_order
+from attentionvote.simulation.raycast import BinSurface
 
 Heap = Callable[..., NDArray]
 
@@ -89,3 +91,15 @@ def test_windows_hold_the_outline_and_what_is_hidden_is_not_selected() -> None:
     chosen = chosen.copy()
     hits.keep(chosen[::2], np.full(len(chosen[::2]), 0.4, np.float32), np.zeros(len(chosen[::2]), np.int32), 1)
     np.testing.assert_array_equal(hits.select(windows, 0, first, last)[0], chosen[1::2])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_bin_has_the_same_depth_in_c(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn = rotation_about((1, 0, 0), np.pi + rng.uniform(-0.9, 0.9)) @ rotation_about((0, 0, 1), rng.uniform(-3, 3))
+    surface = BinSurface(np.array([0.3, 0.2, 0.1]), transform(turn, (*rng.uniform(-0.1, 0.1, 2), 0.6)))
+    xy = rng.uniform(-0.7, 0.7, (5000, 2))
+    depth = surface.depth(xy)
+    with native.disabled():
+        np.testing.assert_array_equal(depth, surface.depth(xy))
+    assert 100 < np.isfinite(depth).sum() < 5000

@@ -1,7 +1,10 @@
-/* Which rays of a sample are cast, and which hits stay: what numpy needs many passes for.
+/* Which rays of a sample are cast, which hits stay, and where rays end in the bin: what numpy needs many passes for.
  *
- * Plain C99, called through ctypes (ray_selection.py), which also holds the slow versions that the tests compare with.
+ * Plain C99, called through ctypes (ray_selection.py, raycast.py), which also hold the slow versions that the tests
+ * compare with.
  */
+#include <float.h>
+#include <math.h>
 #include <stdint.h>
 
 #define CHUNK 256
@@ -59,6 +62,29 @@ int keep_nearer(const int32_t *chosen, int32_t count, const float *t, const int3
         const int32_t at = chosen[i];
         if (hit[i] < 0 || t[i] > nearest[at] || (t[i] == nearest[at] && owner[at] < instance)) continue;
         nearest[at] = t[i], owner[at] = instance, face[at] = hit[i];
+    }
+    return 0;
+}
+
+/* Depths at which rays (x, y, 1) from the camera end on floor or walls of the bin, inf for those that miss it;
+ * bin_from_camera is 4x4, the size in metres. */
+int bin_depth(const double *xy, int32_t n, const double *bin_from_camera, const double *size, double *depth) {
+    const double *m = bin_from_camera;
+    for (int32_t i = 0; i < n; i++) {
+        const double x = xy[2 * (int64_t)i], y = xy[2 * (int64_t)i + 1];
+        double enter = -DBL_MAX, leave = DBL_MAX;
+        int through_top = 0;
+        for (int a = 0; a < 3; a++) {
+            const double low = a == 2 ? 0 : -size[a] / 2, high = a == 2 ? size[a] : size[a] / 2;
+            const double direction = x * m[4 * a] + (y * m[4 * a + 1] + m[4 * a + 2]);
+            const double inverted = 1 / (fabs(direction) < 1e-15 ? 1e-15 : direction);
+            const double one = (low - m[4 * a + 3]) * inverted, two = (high - m[4 * a + 3]) * inverted;
+            const double near = one < two ? one : two, far = one < two ? two : one;
+            through_top = (near > enter) & (direction < 0); /* holds for the last axis, z */
+            enter = near > enter ? near : enter, leave = far < leave ? far : leave;
+        }
+        const double end = through_top ? leave : enter;
+        depth[i] = enter < leave && end > 0 ? end : (double)INFINITY;
     }
     return 0;
 }

@@ -119,9 +119,8 @@ def synthesize(
         if scanner is not None:
             new_points, new_ids = scanner.measure(pixels, hits)
         else:
-            foreground = hits.instance >= 0
-            seen = rays[foreground]
-            new_points = np.c_[seen, np.ones(len(seen))] * hits.depth[foreground, None]
+            foreground = np.flatnonzero(hits.instance >= 0)
+            new_points = _points(rays.take(foreground, axis=0), hits.depth[foreground])
             new_ids = hits.instance[foreground]
         points.append(new_points)
         ids.append(new_ids)
@@ -136,6 +135,15 @@ def synthesize(
         visible_fraction=record.visible_fraction,
         part_ids=record.part_ids,
     )
+
+
+def _points(rays: Floats, depth: Floats) -> Floats:
+    """``(P, 3)`` camera frame: where rays ``(P, 2)`` have a depth."""
+    points = np.empty((len(rays), 3))
+    for axis in range(2):  # column by column: a third of the time of arrays (P, 2)
+        np.multiply(rays[:, axis], depth, out=points[:, axis])
+    points[:, 2] = depth
+    return points
 
 
 class _Scanner:
@@ -156,7 +164,7 @@ class _Scanner:
         keep = np.flatnonzero(hits.instance >= 0)
         keep = keep[rng.random(len(keep)) >= sensor.dropout]
         rays = self.record.camera.rays(pixels[keep])
-        points = np.c_[rays, np.ones(len(rays))] * hits.depth[keep, None]
+        points = _points(rays, hits.depth[keep])
         cosine, lost = self._reflection(points, hits.normal[keep])
         seen = rng.random(len(keep)) >= lost
         keep, points, cosine = keep[seen], points[seen], cosine[seen]
