@@ -141,7 +141,7 @@ def with_normals(scene: Scene, rng: np.random.Generator, settings: CloudSettings
             empty, np.zeros(0, np.int32), scene.camera_from_part, scene.visible_fraction, scene.part_ids, empty
         )
     kept = sample_indices(len(scene.points), min(settings.pool, len(scene.points)), rng)
-    points = scene.points[kept]
+    points = scene.points.take(kept, axis=0)
     normals = estimate_normals(scene.points, points, settings.neighbors)
     ids = scene.instance_ids[kept]
     return Scene(points, ids, scene.camera_from_part, scene.visible_fraction, scene.part_ids, normals)
