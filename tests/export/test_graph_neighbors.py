@@ -18,7 +18,7 @@ from attentionvote.export.onnx_file import quiet_exporter
 from attentionvote.model import Layout
 from attentionvote.model.neighborhoods import find_neighborhoods
 
-COUNT = 600  # not a multiple of a row of the two-step ArgMax
+COUNT = 600
 LAYOUT = Layout((64, 32, 16, 8), (16, 8, 8, 4), (0.02, 0.04, 0.06, 0.12))
 pytestmark = pytest.mark.slow
 

@@ -19,9 +19,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from attentionvote.export import graph_farthest_points, graph_neighbors, graph_operators
-from attentionvote.geometry.sampling import ball_query, farthest_point_order
+from attentionvote.geometry.sampling import farthest_point_order, level_neighbors
 
-KINDS = ("uniform", "lattice", "repeated", "one place", "stray", "line", "plane", "two heaps")
+KINDS = ("uniform", "lattice", "repeated", "one place", "stray", "line", "plane", "two heaps", "far", "farthest")
 
 
 def session(
@@ -61,6 +61,8 @@ def cloud(kind: str, count: int) -> NDArray[np.float32]:
         points[:, :2] = 0.1
     elif kind == "plane":
         points[:, 2] = 0.7
+    elif kind in ("far", "farthest"):  # beyond what float32 can square
+        points[::100] = 1e20 if kind == "far" else np.finfo(np.float32).max
     elif kind == "two heaps":
         points[::2] += [5.0, 0.0, 0.0]
     return points.astype(np.float32)
@@ -78,6 +80,14 @@ SMALL = 40
 SPOTS = st.integers(-3, 3).map(lambda n: n * 0.125)
 
 
+@cache
+def tied() -> onnxruntime.InferenceSession:
+    """With a table that most ties do not fit in."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(graph_farthest_points, "CANDIDATES", 8)
+        return session("FarthestPoints", SMALL, [[SMALL]], count=SMALL)
+
+
 @settings(deadline=None, max_examples=150)
 @given(arrays(np.float32, (SMALL, 3), elements=SPOTS))
 def test_ties_and_repetitions_of_every_kind(xyz: NDArray[np.float32]) -> None:
@@ -86,9 +96,23 @@ def test_ties_and_repetitions_of_every_kind(xyz: NDArray[np.float32]) -> None:
     np.testing.assert_array_equal(found, farthest_point_order(xyz, SMALL))
 
 
+EDGES = ([30, 20, 10, 5], [12, 8, 6, 4], [0.125, 0.25, 0.375, 0.5])
+
+
 @cache
-def tied() -> onnxruntime.InferenceSession:
-    return session("FarthestPoints", SMALL, [[SMALL]], count=SMALL)
+def edges() -> onnxruntime.InferenceSession:
+    shapes = [EDGES[0][:1], *([c, k] for c, k in zip(*EDGES[:2], strict=True))]
+    return session("Neighborhoods", 300, shapes, centers=EDGES[0], neighbors=EDGES[1], radii=EDGES[2])
+
+
+@settings(deadline=None, max_examples=50)
+@given(arrays(np.float32, (300, 3), elements=st.integers(-8, 8).map(lambda n: n * 0.125)))
+def test_a_point_at_exactly_the_radius_is_inside(xyz: NDArray[np.float32]) -> None:
+    """Of a ball, and the box of its block is within reach of the centres'."""
+    order, *found = edges().run(None, {"points": xyz})
+    expected, neighbors = level_neighbors(xyz, *EDGES)
+    for actual, wanted in zip([order, *found], [expected, *neighbors], strict=True):
+        np.testing.assert_array_equal(actual, wanted)
 
 
 def test_a_table_smaller_than_the_ties_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,13 +156,14 @@ def test_neighbourhoods_are_those_of_the_c_code(kind: str, points: int) -> None:
     centers, neighbors, radii = [19, 16, 9, 1], [24, 40, 8, 3], [0.03, 0.05, 0.08, 0.2]
     shapes = [centers[:1], *([c, k] for c, k in zip(centers, neighbors, strict=True))]
     model = session("Neighborhoods", points, shapes, centers=centers, neighbors=neighbors, radii=radii)
-    order, *found = model.run(None, {"points": xyz})
-    np.testing.assert_array_equal(order, farthest_point_order(xyz, centers[0]))
-    below = xyz
-    for actual, size, count, radius in zip(found, centers, neighbors, radii, strict=True):
-        chosen = xyz[order[:size]]
-        np.testing.assert_array_equal(actual, ball_query(below, chosen, radius, count)[0])
-        below = chosen
+    expected, lists = level_neighbors(xyz, centers, neighbors, radii)
+    for actual, wanted in zip(model.run(None, {"points": xyz}), [expected, *lists], strict=True):
+        np.testing.assert_array_equal(actual, wanted)
+
+
+def test_more_points_than_there_are_cannot_be_chosen() -> None:
+    with pytest.raises(ValueError, match=r"count must lie in 1..20 \(the number of points\), got 21"):
+        session("FarthestPoints", 20, [[21]], count=21)
 
 
 def test_outside_of_a_trace_the_operators_answer_zeros() -> None:

@@ -23,7 +23,7 @@ def ball_query(op: Any, blocks: Blocks, centers: ir.Value, number: int, radius: 
 
     Args:
         op: the builder.
-        blocks: the points; of at least ``count`` each.
+        blocks: the points, in blocks of at least ``count`` places.
         centers: ``(3, number)``.
         number: of centres.
         radius: metres.

@@ -13,9 +13,9 @@ NOWHERE = float(2**24)  # label of a spare place; float32 can tell all numbers b
 
 
 class Blocks(NamedTuple):
-    """Points in blocks.
+    """Points in blocks, metres.
 
-    Args:
+    Attributes:
         indices: ``(blocks, size)`` int64, of the points; spare places repeat one.
         label: the same as float32, but ``NOWHERE`` at spare places.
         points: ``(3, blocks, size)``.
@@ -34,11 +34,18 @@ class Blocks(NamedTuple):
 def in_blocks(op: Any, planes: ir.Value, count: int, size: int) -> Blocks:
     """Points in strips of equal count along x, each strip cut into blocks along y: ranks, so that strays do no harm.
 
+    The view is from above the bin; a cloud that is a line along z has blocks without a shape, and is slow.
+
     Args:
         op: the builder.
         planes: ``(3, count)``.
         count, size: points in all and in a block.
+
+    Raises:
+        ValueError: when there are more points than labels.
     """
+    if count >= NOWHERE:
+        raise ValueError(f"count must be less than {NOWHERE:.0f} points, got {count}")
     strips = max(1, round((count / size) ** 0.5))
     blocks = strips * -(-count // (size * strips))
     spare = blocks * size - count

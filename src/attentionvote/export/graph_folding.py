@@ -67,7 +67,8 @@ class GraphVoteBranch(nn.Module):
 
 def _normed(layer: nn.Linear, norm: GraphNorm, bias: bool) -> nn.Linear:
     """A linear layer and what the norm behind it does to its answer; without the norm's shift unless ``bias``."""
-    result = nn.Linear(layer.in_features, layer.out_features, bias=bias)
+    assert bias or layer.bias is None
+    result: nn.Linear = nn.utils.skip_init(nn.Linear, layer.in_features, layer.out_features, bias=bias)
     result.weight.data = layer.weight.detach() * norm.scale[:, None]
     if bias:
         before = 0 if layer.bias is None else layer.bias.detach() * norm.scale

@@ -69,11 +69,11 @@ def _pair_features(near: Float[Tensor, "rows 6"], middle: Float[Tensor, "centers
     """What ``pair_features`` is made of, by planes, all neighbours of a centre in succession: offset, normal, distance,
     and the products whose sums are the cosines."""
     planes, own = near.T.reshape(6, len(middle), -1), middle.T[:, :, None]
-    offset, normal, turned = planes[:3] - own[:3], planes[3:], own[3:]
+    offset, normal, own_normal = planes[:3] - own[:3], planes[3:], own[3:]
     squared = torch.ones(1, 3) @ (offset * offset).view(3, -1)
     distance = squared.sqrt().view(1, len(middle), -1)
     unit = offset / (distance + TINY)
-    channels = torch.cat([offset, normal, distance, turned * unit, normal * unit, turned * normal])
+    channels = torch.cat([offset, normal, distance, own_normal * unit, normal * unit, own_normal * normal])
     return channels.view(len(channels), -1)
 
 
@@ -131,11 +131,11 @@ class GraphRefiner(nn.Module):
         layer, weights = self.layer, list(self.layer.weights)
         total, count = points.shape[1], min(layer.points, points.shape[1])
         chunk = _divisor(len(center), _POSES)
-        # Around the middle of the cloud: float32 has more digits there.
-        middle = points[0].mean(0)
-        columns = torch.cat([points[0] - middle, torch.ones(total, 1)], dim=1).T.contiguous()
+        # A fourth row of ones moves the box's middle to zero.
+        planes = torch.cat([points[0], torch.ones(total, 1)], dim=1).T.contiguous()
         cloud = torch.cat([points[0], normals[0]], dim=1)
-        half, box_middle = (layer.box[1] - layer.box[0]) / 2, (layer.box[1] + layer.box[0]) / 2
+        half = (layer.box[1] - layer.box[0]) / 2
+        shift = -((layer.box[1] + layer.box[0]) / 2 / half).view(1, 3, 1)
         scale = torch.tensor([layer.scale] * 3 + [1.0] * 3)
         # First in index order = largest of a falling rank; 0 for a point outside.
         rank = torch.arange(total, 0, -1, dtype=torch.float32)
@@ -143,9 +143,9 @@ class GraphRefiner(nn.Module):
         def step(carry: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
             center, turn = poses
             # In units of the box around its middle: inside is what lies within one in every direction.
-            shift = (center - middle)[:, None] @ turn + box_middle
-            rows = torch.cat([turn.transpose(1, 2), -shift.transpose(1, 2)], dim=2) / half[:, None]
-            x, y, z = (rows.transpose(0, 1).reshape(3 * chunk, 4) @ columns).abs().view(3, chunk, total).unbind(0)
+            away = planes - torch.cat([center, torch.zeros(chunk, 1)], dim=1)[:, :, None]
+            box_from_camera = torch.cat([turn.transpose(1, 2) / half[:, None], shift.expand(chunk, 3, 1)], dim=2)
+            x, y, z = (box_from_camera @ away).abs().unbind(1)
             inside = torch.maximum(torch.maximum(x, y), z) <= 1
             found, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count, dim=1)
             number = (found > 0).sum(1, keepdim=True)
