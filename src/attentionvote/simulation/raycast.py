@@ -139,9 +139,10 @@ class PartCaster:
         windows, hits = self._windows(camera_from_part, kinds), FirstHits(xy)
         first, last = hits.slices(windows)
         # What lies nearer hides rays from the rest.
+        part_from_camera = inverse(camera_from_part)
         for i in np.argsort(windows.near, kind="stable"):
             chosen, rays = hits.select(windows, i, first[i], last[i])
-            hits.keep(chosen, *self._cast_one(kinds[i], camera_from_part[i], rays), i)
+            hits.keep(chosen, *self._cast_one(kinds[i], part_from_camera[i], rays), i)
         depth, instance = np.full(len(xy), np.inf), np.full(len(xy), -1, dtype=np.int32)
         normal = np.zeros((len(xy), 3))
         hit = np.flatnonzero(hits.owner >= 0)
@@ -204,7 +205,7 @@ class PartCaster:
         nearest = np.full(buffer_size[::-1], np.inf, dtype=np.float32)
         owner = np.full(buffer_size[::-1], -1, dtype=np.int32)
         silhouette = np.zeros(count)
-        for i, pose in enumerate(camera_from_part):
+        for i, part_from_camera in enumerate(inverse(camera_from_part)):
             (u, v), (width, height) = first[i], last[i] - first[i] + 1
             if min(width, height) < 1:
                 continue
@@ -212,7 +213,7 @@ class PartCaster:
             rays = np.ones((height, width, 3), dtype=np.float32)
             rays[..., 0] = (np.arange(u, u + width) * stride - centre[0]) / focal[0]
             rays[..., 1] = ((np.arange(v, v + height) * stride - centre[1]) / focal[1])[:, None]
-            depth, silhouette[i] = self._depth(kinds[i], pose, rays, windows, i)
+            depth, silhouette[i] = self._depth(kinds[i], part_from_camera, rays, windows, i)
             column, row = (u, v) - origin
             window = slice(row, row + height), slice(column, column + width)
             closer = depth < nearest[window]
@@ -253,7 +254,7 @@ class PartCaster:
         return windows
 
     def _depth(
-        self, kind: int, pose: Floats, rays: NDArray[np.float32], windows: Windows, i: int
+        self, kind: int, part_from_camera: Floats, rays: NDArray[np.float32], windows: Windows, i: int
     ) -> tuple[NDArray[np.float32], int]:
         """Depth ``(H, W)`` of instance ``i`` alone along a grid of rays ``(H, W, 3)``, inf for misses; hits."""
         x, y = rays[0, :, 0], rays[:, 0, 1]
@@ -262,19 +263,18 @@ class PartCaster:
         rays = rays.reshape(-1, 3)
         if len(chosen) < 2:  # one ray is turned by another routine than many, with another rounding
             chosen = np.arange(len(rays))
-        t, face = self._cast_one(kind, pose, rays[chosen])
+        t, face = self._cast_one(kind, part_from_camera, rays.take(chosen, axis=0))
         t[face < 0] = np.inf
         depth = np.full((len(y), len(x)), np.inf, dtype=np.float32)
         depth.reshape(-1)[chosen] = t
         return depth, int((face >= 0).sum())
 
     def _cast_one(
-        self, kind: int, pose: Floats, rays: NDArray[np.float32]
+        self, kind: int, part_from_camera: Floats, rays: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays ``(P, 3)`` (x, y, 1) at one instance alone."""
         if not len(rays):
             return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int32)
-        part_from_camera = inverse(pose)
         direction = rays @ part_from_camera[:3, :3].T.astype(np.float32)
         # Embree wants an origin for every ray: all are the same three numbers.
         origin = as_strided(part_from_camera[:3, 3].astype(np.float32), direction.shape, (0, 4))
