@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.geometry import native
-from attentionvote.model.row_threads import in_threads, thread_count
+from attentionvote.model.row_threads import LEAST_ROWS, in_threads, thread_count
 
 MOST_NEIGHBORS = 256  # the winner of a maximum is kept in a byte
 MOST_LAYERS = 9  # as many as the kernel has pointers for
@@ -98,6 +98,7 @@ class _PooledMLP(torch.autograd.Function):
         in_threads(
             centers,
             lambda _, a, b: native.call(library.pooled_forward, *arguments(a, b), out.numpy(), winner.numpy()),
+            _least(geometry),
         )
         ctx.save_for_backward(geometry, projected, index, winner, *weights)
         return out
@@ -111,7 +112,7 @@ class _PooledMLP(torch.autograd.Function):
         assert library is not None
         transposed = _Pointers([w.detach().contiguous() for w in weights[0::2]])
         partial: list[tuple[list[Tensor], Tensor | None]] = []
-        for _ in range(thread_count(len(geometry))):
+        for _ in range(thread_count(len(geometry), _least(geometry))):
             # Narrow inputs: the first layer's gradient is gathered as (in, out) rows.
             sums = [torch.zeros(w.shape if i else w.T.shape) for i, w in enumerate(weights)]
             partial.append((sums, None if projected is None else torch.zeros_like(projected)))
@@ -129,7 +130,7 @@ class _PooledMLP(torch.autograd.Function):
                 None if grad_projected is None else grad_projected.numpy(),
             )
 
-        in_threads(len(geometry), run)
+        in_threads(len(geometry), run, _least(geometry))
         sums, grad_projected = partial[0]
         for more, more_projected in partial[1:]:
             for total, part in zip(sums, more, strict=True):
@@ -137,6 +138,11 @@ class _PooledMLP(torch.autograd.Function):
             if grad_projected is not None and more_projected is not None:
                 grad_projected += more_projected
         return None, grad_projected, None, sums[0].T, *sums[1:]
+
+
+def _least(geometry: Tensor) -> int:
+    """Centres that are worth a thread: few, where each has many neighbours."""
+    return min(LEAST_ROWS, max(1, 1024 // max(1, geometry.shape[1])))
 
 
 class _Pointers:
