@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry import native
 from attentionvote.geometry.pose import rotation_about, transform
-from attentionvote.simulation import PartCaster
+from attentionvote.simulation import Camera, PartCaster
 from attentionvote.simulation.ray_selection import FirstHits, Windows, random_order
 from attentionvote.simulation.raycast import BinSurface
 
@@ -103,3 +103,11 @@ def test_the_bin_has_the_same_depth_in_c(seed: int) -> None:
     with native.disabled():
         np.testing.assert_array_equal(depth, surface.depth(xy))
     assert 100 < np.isfinite(depth).sum() < 5000
+
+
+def test_the_visible_share_is_the_same_in_c(caster: PartCaster, heap: Heap) -> None:
+    poses = heap(12)
+    share = caster.visible_fraction(poses, Camera(), None)
+    with native.disabled():
+        np.testing.assert_array_equal(share, caster.visible_fraction(poses, Camera(), None))
+    assert share.min() < 0.9 < share.max()

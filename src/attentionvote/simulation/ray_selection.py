@@ -54,23 +54,48 @@ class Windows(NamedTuple):
         self.near[own] = outline[..., 2].min(axis=1) * (1 - _NEARER)
 
 
-class FirstHits:
-    """Rays ``xy`` ``(P, 2)`` in the order of x, and what each has met so far.
+class NearestHits:
+    """What each of ``count`` rays has met so far.
 
     Attributes:
-        order: ``(P,)`` index of each ray in ``xy``.
         nearest: ``(P,)`` depth in metres, inf for nothing.
         owner, face: ``(P,)`` instance, -1 for none, and its face.
     """
 
+    def __init__(self, count: int) -> None:
+        self.nearest = np.full(count, np.inf, dtype=np.float32)
+        self.owner = np.full(count, -1, dtype=np.int32)
+        self.face = np.zeros(count, dtype=np.int32)
+        self._library = native.load("attentionvote.simulation", "rays.c")
+
+    def keep(self, chosen: NDArray, depth: NDArray[np.float32], face: NDArray[np.int32], instance: int) -> None:
+        """Take over hits of the rays ``chosen`` ``(C,)`` on an instance, face -1 for none, where they are the nearest.
+
+        Of equally near instances the one with the lowest index stays, whatever the order of the calls.
+        """
+        if self._library is not None:
+            rays, hit = (np.ascontiguousarray(a, dtype=np.int32) for a in (chosen, face))
+            into = self.nearest, self.owner, self.face
+            native.call(self._library.keep_nearer, rays, len(rays), depth, hit, int(instance), *into)
+            return
+        before = self.nearest[chosen]
+        nearer = (face >= 0) & ((depth < before) | ((depth == before) & (instance < self.owner[chosen])))
+        chosen = chosen[nearer]
+        self.nearest[chosen], self.owner[chosen], self.face[chosen] = depth[nearer], instance, face[nearer]
+
+
+class FirstHits(NearestHits):
+    """Hits of rays ``xy`` ``(P, 2)``, which are in the order of x.
+
+    Attributes:
+        order: ``(P,)`` index of each ray in ``xy``.
+    """
+
     def __init__(self, xy: Floats) -> None:
+        super().__init__(len(xy))
         # Sorted by x, the rays that can meet an instance are a slice, then comparisons.
         self.order = np.argsort(xy[:, 0])
         self._x, self._y = xy[self.order, 0], xy[self.order, 1]
-        self.nearest = np.full(len(xy), np.inf, dtype=np.float32)
-        self.owner = np.full(len(xy), -1, dtype=np.int32)
-        self.face = np.zeros(len(xy), dtype=np.int32)
-        self._library = native.load("attentionvote.simulation", "rays.c")
         self._chosen = np.empty(len(xy) + 1, dtype=np.int32)
         self._rays = np.empty((len(xy) + 1, 3), dtype=np.float32)
 
@@ -98,21 +123,6 @@ class FirstHits:
         found = window, self._chosen, self._rays, count
         native.call(self._library.select_rays, self._x, self._y, self.nearest, int(first), int(last), *found)
         return self._chosen[: count[0]], self._rays[: count[0]]
-
-    def keep(self, chosen: NDArray, depth: NDArray[np.float32], face: NDArray[np.int32], instance: int) -> None:
-        """Take over hits of the rays ``chosen`` ``(C,)`` on an instance, face -1 for none, where they are the nearest.
-
-        Of equally near instances the one with the lowest index stays, whatever the order of the calls.
-        """
-        if self._library is not None:
-            rays, hit = (np.ascontiguousarray(a, dtype=np.int32) for a in (chosen, face))
-            into = self.nearest, self.owner, self.face
-            native.call(self._library.keep_nearer, rays, len(rays), depth, hit, int(instance), *into)
-            return
-        before = self.nearest[chosen]
-        nearer = (face >= 0) & ((depth < before) | ((depth == before) & (instance < self.owner[chosen])))
-        chosen = chosen[nearer]
-        self.nearest[chosen], self.owner[chosen], self.face[chosen] = depth[nearer], instance, face[nearer]
 
 
 def random_order(count: int, rng: np.random.Generator) -> NDArray[np.int32]:

@@ -18,7 +18,7 @@ from attentionvote.geometry import native
 from attentionvote.geometry.pose import apply, inverse
 from attentionvote.part import Parts
 from attentionvote.simulation.camera import Camera
-from attentionvote.simulation.ray_selection import FirstHits, Windows
+from attentionvote.simulation.ray_selection import FirstHits, NearestHits, Windows
 
 Floats = NDArray[np.float64]
 
@@ -202,30 +202,32 @@ class PartCaster:
         last = np.floor((high * focal + centre) / stride).astype(int)
         origin = np.minimum(first.min(axis=0), 0)
         buffer_size = np.maximum(last.max(axis=0), (size - 1) // stride) - origin + 1
-        nearest = np.full(buffer_size[::-1], np.inf, dtype=np.float32)
-        owner = np.full(buffer_size[::-1], -1, dtype=np.int32)
-        silhouette = np.zeros(count)
+        hits, silhouette = NearestHits(int(buffer_size.prod())), np.zeros(count)
         for i, part_from_camera in enumerate(inverse(camera_from_part)):
-            (u, v), (width, height) = first[i], last[i] - first[i] + 1
-            if min(width, height) < 1:
-                continue
             # A ray's x is its column's, its y its row's.
-            rays = np.ones((height, width, 3), dtype=np.float32)
-            rays[..., 0] = (np.arange(u, u + width) * stride - centre[0]) / focal[0]
-            rays[..., 1] = ((np.arange(v, v + height) * stride - centre[1]) / focal[1])[:, None]
-            depth, silhouette[i] = self._depth(kinds[i], part_from_camera, rays, windows, i)
-            column, row = (u, v) - origin
-            window = slice(row, row + height), slice(column, column + width)
-            closer = depth < nearest[window]
-            np.copyto(nearest[window], depth, where=closer)
-            owner[window][closer] = i
-        row, column = np.nonzero(owner >= 0)
-        pixels = (np.stack([column, row], axis=1) + origin) * stride
+            column, row = (np.arange(first[i, axis], last[i, axis] + 1) for axis in range(2))
+            x = ((column * stride - centre[0]) / focal[0]).astype(np.float32)
+            y = ((row * stride - centre[1]) / focal[1]).astype(np.float32)
+            across = x * np.float32(windows.across[i, 0]) + (y * np.float32(windows.across[i, 1]))[:, None]
+            meets = (across >= windows.low_across[i]) & (across <= windows.high_across[i])
+            if np.count_nonzero(meets) < 2:  # one ray is turned by another routine than many, with another rounding
+                meets[:] = True
+            chosen = np.flatnonzero(meets)
+            v = chosen // max(len(x), 1)
+            u = chosen - v * len(x)
+            rays = np.ones((len(u), 3), dtype=np.float32)
+            rays[:, 0], rays[:, 1] = x[u], y[v]
+            depth, face = self._cast_one(kinds[i], part_from_camera, rays)
+            silhouette[i] = np.count_nonzero(face >= 0)
+            pixel = (row[v] - origin[1]) * buffer_size[0] + (column[u] - origin[0])
+            hits.keep(pixel, depth, face, i)
+        found = np.flatnonzero(hits.owner >= 0)
+        owner, row = hits.owner[found], found // buffer_size[0]
+        pixels = (np.stack([found - row * buffer_size[0], row], axis=1) + origin) * stride
         seen = ((pixels >= 0) & (pixels < size)).all(axis=1)
         if surface is not None:
-            sunk = self._sunk[kinds[owner[row, column]]]
-            seen &= nearest[row, column] < surface.depth(camera.rays(pixels)) + sunk
-        visible = np.bincount(owner[row, column][seen], minlength=count)
+            seen &= hits.nearest[found] < surface.depth(camera.rays(pixels)) + self._sunk[kinds[owner]]
+        visible = np.bincount(owner[seen], minlength=count)
         return visible / np.maximum(silhouette, 1)
 
     def pixel_box(
@@ -252,22 +254,6 @@ class PartCaster:
                 raise ValueError(f"{part.name}: every instance must lie in front of the camera, one reaches z <= 0")
             windows.fill(own, outline)
         return windows
-
-    def _depth(
-        self, kind: int, part_from_camera: Floats, rays: NDArray[np.float32], windows: Windows, i: int
-    ) -> tuple[NDArray[np.float32], int]:
-        """Depth ``(H, W)`` of instance ``i`` alone along a grid of rays ``(H, W, 3)``, inf for misses; hits."""
-        x, y = rays[0, :, 0], rays[:, 0, 1]
-        across = x * np.float32(windows.across[i, 0]) + (y * np.float32(windows.across[i, 1]))[:, None]
-        chosen = np.flatnonzero((across >= windows.low_across[i]) & (across <= windows.high_across[i]))
-        rays = rays.reshape(-1, 3)
-        if len(chosen) < 2:  # one ray is turned by another routine than many, with another rounding
-            chosen = np.arange(len(rays))
-        t, face = self._cast_one(kind, part_from_camera, rays.take(chosen, axis=0))
-        t[face < 0] = np.inf
-        depth = np.full((len(y), len(x)), np.inf, dtype=np.float32)
-        depth.reshape(-1)[chosen] = t
-        return depth, int((face >= 0).sum())
 
     def _cast_one(
         self, kind: int, part_from_camera: Floats, rays: NDArray[np.float32]
