@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import history
@@ -178,27 +180,42 @@ def test_a_rollback_to_a_version_whose_artefacts_are_gone_moves_nothing(verb, mo
     assert Versions(store, "brick").champion().number == 2
 
 
+def wait_for_both(both: list[subprocess.Popen[str]], folders: list[Path]) -> None:
+    """Whoever has seen where the champion stands, and makes a folder to measure in, waits until the other has, too."""
+    waiting = dict(zip(folders, both, strict=True))
+    until = time.monotonic() + 120
+    while waiting:
+        assert time.monotonic() < until
+        for folder, process in list(waiting.items()):
+            assert process.poll() is None, process.communicate()[1][-500:]
+            if any(folder.glob("attentionvote-*")):
+                process.send_signal(signal.SIGSTOP)
+                del waiting[folder]
+        time.sleep(0.005)
+    for process in both:
+        process.send_signal(signal.SIGCONT)
+
+
 @pytest.mark.usefixtures("database")
 @pytest.mark.slow
 def test_of_two_processes_that_promote_at_once_exactly_one_wins(verb, model, store, few_scenes, easy_gates, tmp_path):
     model("zero")
     verb("promote")
     words = [*few_scenes, *easy_gates, f"tracking.store='{store}'"]
-    # Both measure for seconds against the same champion: whoever comes second must lose.
-    words += ["evaluation.density=40000", "simulation.drop_counts=[2,3,4,5,6,7,8,9]", "gates.scenes=1"]
-    command = [sys.executable, str(ROOT / "pipelines" / "promote.py"), *words]
-    for attempt in range(4):
-        digests = [model(f"{name}{attempt}").digest for name in ("one", "two")]
-        both = [
-            subprocess.Popen(
-                [*command, f"bundle='{digest[:12]}'"], cwd=tmp_path, env=dict(os.environ), text=True,
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            )
-            for digest in digests
-        ]  # fmt: skip
-        ends = [process.communicate(timeout=200) for process in both]
-        if [process.returncode for process in both] != [0, 0]:
-            break  # on a busy machine one may start after the other has ended
+    command = [sys.executable, str(ROOT / "pipelines" / "promote.py"), *words, "gates.scenes=1"]
+    digests = [model(name).digest for name in ("one", "two")]
+    folders = [tmp_path / f"temporary_{digest[:4]}" for digest in digests]
+    for folder in folders:
+        folder.mkdir()
+    both = [
+        subprocess.Popen(
+            [*command, f"bundle='{digest[:12]}'"], cwd=tmp_path, env=dict(os.environ) | {"TMPDIR": str(folder)},
+            text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )
+        for digest, folder in zip(digests, folders, strict=True)
+    ]  # fmt: skip
+    wait_for_both(both, folders)
+    ends = [process.communicate(timeout=200) for process in both]
     codes = sorted(process.returncode for process in both)
     assert codes == [0, 1], [end[1][-500:] for end in ends]
     winner = next(i for i in range(2) if both[i].returncode == 0)
