@@ -181,6 +181,7 @@ def test_the_server_imports_no_training_stack_and_leaves_nothing_at_home(
         "open3d",
         "onnx",
         "onnxscript",
+        "onnx_ir",
     )
     program = f"""
 import sys
