@@ -13,7 +13,7 @@ from torch.utils import _pytree as pytree
 
 from attentionvote.export import graph_layers
 from attentionvote.export.graph_folding import GraphNorm, GraphVoteBranch, folded
-from attentionvote.model.backbone import FeaturePropagation, SetAbstraction
+from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.fusion import VoteBranch
 from attentionvote.model.layers import Residual, RowNorm, shared_mlp
 from attentionvote.model.proposals import heatmap_reference
@@ -64,12 +64,6 @@ def test_set_abstraction(width_in: int, widths: list[int]) -> None:
     index[0, :, 0] = torch.arange(20)  # every centre is its own neighbour, at a distance of zero
     given = xyz, directions(1, 50), features, xyz[:, :20], directions(1, 20), index
     torch.testing.assert_close(graph_layers.GraphSetAbstraction(layer)(*given), layer(*given), **CLOSE)
-
-
-def test_feature_propagation() -> None:
-    layer = trained(FeaturePropagation(6, 4, [16, 8]))
-    given = torch.randn(1, 9, 6), torch.randn(1, 20, 4), torch.randint(0, 9, (1, 20, 3)), torch.rand(1, 20, 3)
-    torch.testing.assert_close(graph_layers.GraphFeaturePropagation(layer)(*given), layer(*given), **CLOSE)
 
 
 @pytest.mark.parametrize("points", [5, 64, 400])

@@ -16,7 +16,7 @@ from torch._higher_order_ops.scan import scan
 from torch.nn.functional import embedding, linear
 
 from attentionvote.export.graph_neighbors import farthest_point_order
-from attentionvote.model.backbone import FeaturePropagation, SetAbstraction
+from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.farthest_votes import FarthestVotes
 from attentionvote.model.point_features import TINY
 from attentionvote.model.proposals import CENTER, SIDE, TIE, Heatmap
@@ -88,26 +88,6 @@ def _pooled(hidden: Float[Tensor, "rows width"], weights: list[Tensor], chunk: i
     for weight, bias in zip(weights[2::2], weights[3::2], strict=True):
         hidden = linear(torch.relu(hidden), weight, bias)
     return hidden.view(chunk, -1, hidden.shape[1]).max(dim=1)[0]
-
-
-class GraphFeaturePropagation(nn.Module):
-    """``FeaturePropagation``, its coarse features gathered by rows."""
-
-    def __init__(self, layer: FeaturePropagation) -> None:
-        super().__init__()
-        self.mlp = layer.mlp
-
-    def forward(
-        self,
-        coarse: Float[Tensor, "1 coarse channels"],
-        fine: Float[Tensor, "1 fine own"],
-        nearest: Int[Tensor, "1 fine 3"],
-        weights: Float[Tensor, "1 fine 3"],
-    ) -> Float[Tensor, "1 fine out"]:
-        """Features at the fine level."""
-        near = [embedding(nearest[0, :, i], coarse[0]) * weights[0, :, i, None] for i in range(3)]
-        out: Tensor = self.mlp(torch.cat([near[0] + near[1] + near[2], fine[0]], dim=1))
-        return out[None]
 
 
 class GraphRefiner(nn.Module):

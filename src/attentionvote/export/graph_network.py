@@ -17,7 +17,7 @@ from attentionvote.export import graph_layers
 from attentionvote.export.graph_folding import GraphNorm, GraphVoteBranch, folded
 from attentionvote.export.graph_neighbors import find_neighborhoods
 from attentionvote.model import AttentionVote, Predictions
-from attentionvote.model.backbone import FeaturePropagation, SetAbstraction
+from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.farthest_votes import FarthestVotes
 from attentionvote.model.fusion import VoteBranch
 from attentionvote.model.layers import RowNorm
@@ -29,7 +29,6 @@ _LAYERS: dict[type[nn.Module], Callable[[Any], nn.Module]] = {
     nn.Sequential: folded,
     VoteBranch: GraphVoteBranch,
     SetAbstraction: graph_layers.GraphSetAbstraction,
-    FeaturePropagation: graph_layers.GraphFeaturePropagation,
     Refiner: graph_layers.GraphRefiner,
     FarthestVotes: lambda _: graph_layers.GraphFarthestVotes(),
     Heatmap: lambda _: graph_layers.GraphHeatmap(),

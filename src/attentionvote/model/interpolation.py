@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import torch
@@ -10,7 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from attentionvote.geometry import native
+from attentionvote.model.kernels import kernels
 from attentionvote.model.row_threads import in_threads
+
+_FILE = "network_ops.c"
 
 
 def interpolate_reference(
@@ -41,16 +43,10 @@ def interpolate(
     weights: Float[Tensor, "batch fine 3"],
 ) -> Float[Tensor, "batch fine both"]:
     """``interpolate_reference`` by the fastest means at hand; ``weights`` get no gradient."""
-    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (coarse, fine, weights))
-    library = _kernels() if plain and not torch.compiler.is_compiling() else None
-    if library is None:
+    if kernels(_FILE, coarse, fine, weights) is None:
         return interpolate_reference(coarse, fine, nearest, weights)
     result: Tensor = _Interpolate.apply(coarse, fine, nearest.long(), weights.detach())
     return result
-
-
-def _kernels() -> ctypes.CDLL | None:
-    return native.load("attentionvote.model", "network_ops.c", tuned=True)
 
 
 class _Interpolate(torch.autograd.Function):
@@ -59,7 +55,7 @@ class _Interpolate(torch.autograd.Function):
         coarse, fine, nearest, weights = (t.contiguous() for t in (coarse, fine, nearest, weights))
         ctx.sizes = coarse.shape[1], fine.shape[1], coarse.shape[2], fine.shape[2]
         out = coarse.new_empty(*fine.shape[:2], coarse.shape[2] + fine.shape[2])
-        given, library = [t.numpy() for t in (coarse, fine, nearest, weights)], _kernels()
+        given, library = [t.numpy() for t in (coarse, fine, nearest, weights)], kernels(_FILE)
         assert library is not None
 
         def work(_: int, *samples: int) -> None:
@@ -75,7 +71,7 @@ class _Interpolate(torch.autograd.Function):
         batch, (below, rows, width, own) = len(weights), ctx.sizes
         grad_coarse, grad_fine = weights.new_empty(batch, below, width), weights.new_empty(batch, rows, own)
         given = [t.numpy() for t in (gradients[0].contiguous(), nearest, weights)]
-        out, library = [t.numpy() for t in (grad_coarse, grad_fine)], _kernels()
+        out, library = [t.numpy() for t in (grad_coarse, grad_fine)], kernels(_FILE)
         assert library is not None
 
         def work(_: int, *samples: int) -> None:

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from attentionvote.geometry import native
+from attentionvote.model.kernels import kernels
 from attentionvote.model.row_threads import in_threads
 
 CHANNELS = 10
@@ -50,8 +51,7 @@ def pair_features(
     radius: float,
 ) -> Float[Tensor, "centers neighbors 10"]:
     """``pair_features_reference`` by the fastest means at hand; carries no gradient (its inputs are measurements)."""
-    plain = points.device.type == "cpu" and points.dtype == torch.float32 and not torch.compiler.is_compiling()
-    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+    library = kernels("network_ops.c", points)
     if library is None:
         return pair_features_reference(points, normals, centers, center_normals, index, radius)
     out = torch.empty(*index.shape, CHANNELS)

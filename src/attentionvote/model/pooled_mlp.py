@@ -19,9 +19,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.geometry import native
+from attentionvote.model.kernels import kernels
 from attentionvote.model.row_threads import LEAST_ROWS, in_threads, thread_count
 
 MOST_NEIGHBORS = 256  # the winner of a maximum is kept in a byte
+_FILE = "pooled_mlp.c"
 MOST_LAYERS = 9  # as many as the kernel has pointers for
 
 
@@ -62,11 +64,7 @@ def pooled_mlp(
     fits = geometry.shape[1] < MOST_NEIGHBORS and all(b.shape[0] % 8 == 0 for b in weights[1::2])
     fits = fits and 2 <= len(weights) // 2 <= MOST_LAYERS
     inputs = [geometry, *weights] if projected is None else [geometry, projected, *weights]
-    # The kernel reads raw memory: under autocast only the projection would be of half precision.
-    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs)
-    plain = plain and not torch.compiler.is_compiling()
-    library = _kernels() if fits and plain else None
-    if library is None:
+    if not fits or kernels(_FILE, *inputs) is None:
         return pooled_mlp_reference(geometry, projected, index, weights)
     result: Tensor = _PooledMLP.apply(geometry.detach(), projected, index.long(), *weights)
     return result
@@ -80,10 +78,6 @@ def pooled_mlp_weights(channels: int, widths: Sequence[int]) -> nn.ParameterList
     return weights
 
 
-def _kernels() -> ctypes.CDLL | None:
-    return native.load("attentionvote.model", "pooled_mlp.c", tuned=True)
-
-
 class _PooledMLP(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, geometry: Tensor, projected: Tensor | None, index: Tensor, *weights: Tensor) -> Tensor:
@@ -93,7 +87,7 @@ class _PooledMLP(torch.autograd.Function):
         out = geometry.new_empty(centers, weights[-1].shape[0])
         winner = torch.empty(out.shape, dtype=torch.uint8)
         arguments = _arguments(geometry, projected, index, weights)
-        library = _kernels()
+        library = kernels(_FILE)
         assert library is not None
         in_threads(
             centers,
@@ -108,7 +102,7 @@ class _PooledMLP(torch.autograd.Function):
         geometry, projected, index, winner, *weights = ctx.saved_tensors
         grad_out = gradients[0].contiguous()
         arguments = _arguments(geometry, projected, index, weights)
-        library = _kernels()
+        library = kernels(_FILE)
         assert library is not None
         transposed = _Pointers([w.detach().contiguous() for w in weights[0::2]])
         partial: list[tuple[list[Tensor], Tensor | None]] = []

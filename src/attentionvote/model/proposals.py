@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from attentionvote.geometry import native
+from attentionvote.model.kernels import kernels
 from attentionvote.model.precision import full_precision
 from attentionvote.model.row_threads import in_threads
 
@@ -101,8 +102,7 @@ class Heatmap(nn.Module):
         self, votes: Float[Tensor, "batch votes 3"], voxel_size: float, window: int
     ) -> tuple[Float[Tensor, "batch votes"], Float[Tensor, "batch votes"], Float[Tensor, "batch votes 3"]]:
         """What ``heatmap_reference`` answers."""
-        plain = votes.device.type == "cpu" and votes.dtype == torch.float32 and not torch.compiler.is_compiling()
-        library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+        library = kernels("network_ops.c", votes)
         if library is None:
             return heatmap_reference(votes, voxel_size, window)
         batch, count, _ = votes.shape
@@ -148,9 +148,7 @@ def gather_votes(
     count: int,
 ) -> Tensor:
     """``gather_votes_reference`` by the fastest means at hand; carries no gradient."""
-    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (votes, center_seed))
-    plain = plain and not torch.compiler.is_compiling()
-    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+    library = kernels("network_ops.c", votes, center_seed)
     if library is None:
         return gather_votes_reference(votes, center_seed, radius, count)
     batch, total, _ = votes.shape

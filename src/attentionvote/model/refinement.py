@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.geometry import native
+from attentionvote.model.kernels import kernels
 from attentionvote.model.layers import RowNorm, shared_mlp
 from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_weights
 from attentionvote.model.precision import full_precision, widened
@@ -78,8 +79,7 @@ def points_in_box(
     count: int,
 ) -> Float[Tensor, "rows count 6"]:
     """``points_in_box_reference`` by the fastest means at hand; carries no gradient."""
-    plain = points.device.type == "cpu" and points.dtype == torch.float32 and not torch.compiler.is_compiling()
-    library = native.load("attentionvote.model", "network_ops.c", tuned=True) if plain else None
+    library = kernels("network_ops.c", points)
     if library is None:
         return points_in_box_reference(points, normals, sample, center, rotation, box, scale, count)
     out = torch.empty(len(center), count, CHANNELS)
