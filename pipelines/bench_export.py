@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry import native
 from attentionvote.inference import PoseEstimator
-from attentionvote.inference.bundle import Bundle
+from attentionvote.inference.bundles.bundle import Bundle
 from attentionvote.inference.preparation import find_neighbors, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.model import Predictions

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.inference import BundleError, Estimate, PoseEstimator, keys_folder, load_bundle, self_test
-from attentionvote.inference.client import Answer, PoseClient, PoseClientError
-from attentionvote.inference.signature import PUBLIC_NAME
+from attentionvote.inference.bundles.signature import PUBLIC_NAME
+from attentionvote.inference.client.pose_client import Answer, PoseClient, PoseClientError
 
 PATIENCE_S = 60.0
 # The server computes the same numbers as this process; a micrometre is room for nothing else.

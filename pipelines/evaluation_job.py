@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from several_parts import only_part
 
 from attentionvote.inference import Bundle, load_bundle
-from attentionvote.inference.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
+from attentionvote.inference.bundles.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
 from attentionvote.part import Parts
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_directory, scene_set_specs
 

@@ -23,7 +23,7 @@ from training_job import MODEL, RESULT
 
 import attentionvote
 from attentionvote.inference import Bundle, BundleError, load_bundle
-from attentionvote.inference.signature import (
+from attentionvote.inference.bundles.signature import (
     PRIVATE_NAME,
     PUBLIC_NAME,
     fingerprint,

@@ -20,7 +20,7 @@ from attentionvote.evaluation.bop_files import (
     read_truth,
 )
 from attentionvote.evaluation.bop_scores import LENGTHS_MM, RESULT_LIMIT, RESULT_LIMITS, SHARES, bop_scores, selected
-from attentionvote.inference.ply_file import points_from_ply
+from attentionvote.inference.scans.ply_file import points_from_ply
 
 log = logging.getLogger("attentionvote.score")
 MOST_VERTICES = 10_000_000

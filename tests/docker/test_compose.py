@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from attentionvote.inference.server import serve
-from attentionvote.inference.server.source import source_of
+from attentionvote.inference.server.model.source import source_of
 
 ROOT = Path(__file__).resolve().parents[2]
 USER = "65532:65532"

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from attentionvote.inference.bundle import load_bundle
+from attentionvote.inference.bundles.bundle import load_bundle
 
 
 @dataclass

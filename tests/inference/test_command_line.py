@@ -17,8 +17,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.inference.command_line import main
-from attentionvote.inference.signature import make_keys
 
 MakeBundle = Callable[..., Path]
 MakeCloud = Callable[..., NDArray[np.float32]]

@@ -15,7 +15,6 @@ from attentionvote.geometry import native
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.geometry.sampling import farthest_point_order
-from attentionvote.inference.depth_files import CameraIntrinsics, read_depth
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.preparation import (
     Crop,
@@ -25,6 +24,7 @@ from attentionvote.inference.preparation import (
     find_neighbors,
     prepare,
 )
+from attentionvote.inference.scans.depth_files import CameraIntrinsics, read_depth
 
 MakeCard = Callable[..., ModelCard]
 MakeCloud = Callable[..., NDArray[np.float32]]

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BUILDER = """
 import importlib.util, sys
 from pathlib import Path
-from attentionvote.inference.signature import make_keys
+from attentionvote.inference.bundles.signature import make_keys
 spec = importlib.util.spec_from_file_location("builder", sys.argv[1])
 builder = importlib.util.module_from_spec(spec)
 sys.modules["builder"] = builder

@@ -19,7 +19,7 @@ from configuration import ConfigurationError, compose
 from refusal import Refused
 
 from attentionvote import tracking
-from attentionvote.inference.signature import make_keys
+from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.registry.versions import Versions
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -21,7 +21,7 @@ import rollback
 from configuration import compose
 
 from attentionvote import tracking
-from attentionvote.inference.client import PoseClient
+from attentionvote.inference.client.pose_client import PoseClient
 from attentionvote.tracking.server import serve
 
 

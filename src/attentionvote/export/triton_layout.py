@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from attentionvote.contract import ModelCard, TensorSpec
-from attentionvote.inference.bundle import Bundle
+from attentionvote.inference.bundles.bundle import Bundle
 
 
 def write_triton(bundle: Bundle, repository: Path, version: int = 1) -> Path:

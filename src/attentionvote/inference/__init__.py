@@ -8,39 +8,39 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from attentionvote.inference.answer import Abstention, Detection, Estimate
-    from attentionvote.inference.bundle import Bundle, GoldenCloud, load_bundle, write_manifest
+    from attentionvote.inference.bundles.bundle import Bundle, GoldenCloud, load_bundle, write_manifest
+    from attentionvote.inference.bundles.signature import keys_folder, load_private_key, load_public_key, make_keys
     from attentionvote.inference.cell import Cell, read_cell
-    from attentionvote.inference.cloud_files import read_cloud
-    from attentionvote.inference.depth_files import CameraIntrinsics, read_depth
     from attentionvote.inference.errors import BundleError, DeadlineExceeded, InputError
     from attentionvote.inference.estimator import PoseEstimator
     from attentionvote.inference.golden import self_test
     from attentionvote.inference.preparation import Crop
-    from attentionvote.inference.signature import keys_folder, load_private_key, load_public_key, make_keys
+    from attentionvote.inference.scans.cloud_files import read_cloud
+    from attentionvote.inference.scans.depth_files import CameraIntrinsics, read_depth
 
 _MODULE_OF = {
     "Abstention": "answer",
-    "Bundle": "bundle",
+    "Bundle": "bundles.bundle",
     "BundleError": "errors",
-    "CameraIntrinsics": "depth_files",
+    "CameraIntrinsics": "scans.depth_files",
     "Cell": "cell",
     "Crop": "preparation",
     "DeadlineExceeded": "errors",
     "Detection": "answer",
     "Estimate": "answer",
-    "GoldenCloud": "bundle",
+    "GoldenCloud": "bundles.bundle",
     "InputError": "errors",
     "PoseEstimator": "estimator",
-    "keys_folder": "signature",
-    "load_bundle": "bundle",
-    "load_private_key": "signature",
-    "load_public_key": "signature",
-    "make_keys": "signature",
+    "keys_folder": "bundles.signature",
+    "load_bundle": "bundles.bundle",
+    "load_private_key": "bundles.signature",
+    "load_public_key": "bundles.signature",
+    "make_keys": "bundles.signature",
     "read_cell": "cell",
-    "read_cloud": "cloud_files",
-    "read_depth": "depth_files",
+    "read_cloud": "scans.cloud_files",
+    "read_depth": "scans.depth_files",
     "self_test": "golden",
-    "write_manifest": "bundle",
+    "write_manifest": "bundles.bundle",
 }
 
 __all__ = [

@@ -13,9 +13,9 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from attentionvote.inference.depth_files import CameraIntrinsics
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.preparation import Crop
+from attentionvote.inference.scans.depth_files import CameraIntrinsics
 
 _MOST_BYTES = 64 * 1024
 

@@ -19,7 +19,7 @@ from attentionvote.inference.errors import BundleError, InputError
 
 if TYPE_CHECKING:
     from attentionvote.inference.answer import Abstention, Estimate
-    from attentionvote.inference.bundle import Trusted
+    from attentionvote.inference.bundles.bundle import Trusted
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 BUNDLE_VARIABLE = "ATTENTIONVOTE_BUNDLE"
@@ -102,7 +102,7 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
     verb = verbs.add_parser("fetch", help="fetch a bundle from a registry", description="Fetch a bundle, verify it.")
     if words[:1] == ["fetch"]:
-        from attentionvote.inference import fetch_command
+        from attentionvote.inference.fetching import command as fetch_command
 
         fetch_command.add_arguments(verb)
         verb.set_defaults(run=fetch_command.run)
@@ -145,7 +145,7 @@ def _threads(word: str) -> int:
 
 def _trusted(options: argparse.Namespace) -> Trusted:
     """Whose signature the options demand."""
-    from attentionvote.inference.signature import PUBLIC_NAME, keys_folder
+    from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder
 
     if options.no_signature:
         return None
@@ -155,10 +155,10 @@ def _trusted(options: argparse.Namespace) -> Trusted:
 def _estimate(options: argparse.Namespace) -> int:
     """Estimate the poses in one cloud or depth image and print them as a table, or as JSON."""
     from attentionvote.inference.cell import Cell, read_cell
-    from attentionvote.inference.cloud_files import read_cloud
-    from attentionvote.inference.depth_files import PNG_MAGIC, read_depth
     from attentionvote.inference.estimator import PoseEstimator
-    from attentionvote.inference.file_bytes import file_bytes
+    from attentionvote.inference.scans.cloud_files import read_cloud
+    from attentionvote.inference.scans.depth_files import PNG_MAGIC, read_depth
+    from attentionvote.inference.scans.file_bytes import file_bytes
 
     if not options.bundle:
         raise InputError(f"estimate needs a bundle, got none: give --bundle PATH or set {BUNDLE_VARIABLE}")
@@ -206,7 +206,7 @@ def table(answer: Estimate | Abstention) -> str:
 
 def _verify_bundle(options: argparse.Namespace) -> int:
     """Check a bundle's signature, the hash of every file, and that model and card belong together."""
-    from attentionvote.inference.bundle import load_bundle
+    from attentionvote.inference.bundles.bundle import load_bundle
 
     trusted = _trusted(options)
     bundle = load_bundle(options.path, trusted)
@@ -228,7 +228,7 @@ def _verify_bundle(options: argparse.Namespace) -> int:
 
 def _keys(options: argparse.Namespace) -> int:
     """Make the key pair that signs bundles; never overwrites one."""
-    from attentionvote.inference.signature import fingerprint, keys_folder, load_public_key, make_keys
+    from attentionvote.inference.bundles.signature import fingerprint, keys_folder, load_public_key, make_keys
 
     private, public = make_keys(Path(options.folder) if options.folder else keys_folder())
     print(f"key {fingerprint(load_public_key(public))}")

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
 from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection, Estimate, detections_from
-from attentionvote.inference.bundle import Bundle, Trusted, load_bundle
-from attentionvote.inference.depth_files import CameraIntrinsics
+from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
+from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder
 from attentionvote.inference.errors import DeadlineExceeded, InputError
 from attentionvote.inference.preparation import Crop, Prepared, TooFewPoints, find_neighbors, prepare
 from attentionvote.inference.runtime import Session
-from attentionvote.inference.signature import PUBLIC_NAME, keys_folder
+from attentionvote.inference.scans.depth_files import CameraIntrinsics
 
 __all__ = ["Abstention", "Detection", "Estimate", "InputError", "PoseEstimator"]
 

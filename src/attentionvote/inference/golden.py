@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.inference.answer import Estimate
-from attentionvote.inference.bundle import Bundle, GoldenCloud
+from attentionvote.inference.bundles.bundle import Bundle, GoldenCloud
 from attentionvote.inference.errors import BundleError, InputError
 from attentionvote.inference.estimator import PoseEstimator
 

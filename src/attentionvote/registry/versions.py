@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attentionvote.inference import Bundle, BundleError, load_bundle
-from attentionvote.inference.bundle import Trusted
+from attentionvote.inference.bundles.bundle import Trusted
 from attentionvote.registry.gates import Origin
 from attentionvote.tracking.run_opening import PATCH, SESSION_TAG, session_folder
 from attentionvote.tracking.store import connect, experiment_id, resolve_store

@@ -44,7 +44,7 @@ def test_every_sentence_of_the_server_is_on_the_page() -> None:
     documented = [
         part.strip(" …:") for part in re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL))
     ]
-    for path in sorted((CELL / "server").glob("*.py")):
+    for path in sorted((CELL / "server").rglob("*.py")):
         for sentence in sentences(path, RAISERS):
             count += 1
             assert any(part in sentence for part in documented if len(part) > 12), f"{path.name}: {sentence}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from attentionvote.inference.registry_reference import RegistryVersion
+from attentionvote.inference.fetching.reference import RegistryVersion
 from attentionvote.inference.server.metrics import Metrics
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from attentionvote.inference.client import PoseClient, Unreachable
+from attentionvote.inference.client.pose_client import PoseClient, Unreachable
 from attentionvote.inference.server import health, serve
 
 COMMAND = [sys.executable, "-m", "attentionvote.inference.command_line", "serve"]

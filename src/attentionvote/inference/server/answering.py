@@ -23,8 +23,8 @@ from attentionvote.inference.server.admission import (
     read_body,
 )
 from attentionvote.inference.server.metrics import Metrics
+from attentionvote.inference.server.model.serving import Served, Serving
 from attentionvote.inference.server.refusal import bad_request
-from attentionvote.inference.server.serving import Served, Serving
 
 # The estimator stops itself at the deadline; this long its own answer about that is waited for.
 _GRACE_S = 0.05

@@ -18,16 +18,16 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from attentionvote.inference.cell import Cell
-from attentionvote.inference.cloud_files import read_cloud
-from attentionvote.inference.depth_files import PNG_MAGIC, read_depth
 from attentionvote.inference.errors import InputError
+from attentionvote.inference.scans.cloud_files import read_cloud
+from attentionvote.inference.scans.depth_files import PNG_MAGIC, read_depth
 from attentionvote.inference.server.access import Tokens
 from attentionvote.inference.server.answering import Answering, Question
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.protocol_routes import ProtocolRoutes, registered
+from attentionvote.inference.server.model.reloading import Watch
+from attentionvote.inference.server.protocol.routes import ProtocolRoutes, registered
 from attentionvote.inference.server.refusal import Refusal, bad_request, nearest
-from attentionvote.inference.server.reloading import Watch
 from attentionvote.inference.server.request_log import RequestLog
 
 DOCUMENTATION = "docs/operating-a-cell.md"

@@ -10,7 +10,7 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from attentionvote.inference.registry_reference import RegistryVersion
+from attentionvote.inference.fetching.reference import RegistryVersion
 
 OUTCOMES = ("ok", "abstained", "rejected", "unauthorized", "overloaded", "unavailable", "deadline", "gone", "failed")
 STAGES = ("receive", "parse", "queue", "estimate", "total")

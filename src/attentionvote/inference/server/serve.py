@@ -18,23 +18,23 @@ from pathlib import Path
 
 import uvicorn
 
-from attentionvote.inference import registry_access
-from attentionvote.inference.bundle import Bundle
+from attentionvote.inference.bundles.bundle import Bundle
+from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder, load_public_key
 from attentionvote.inference.cell import Cell, read_cell
 from attentionvote.inference.errors import BundleError, InputError
 from attentionvote.inference.estimator import PoseEstimator
-from attentionvote.inference.fetched_bundles import FetchedBundles
+from attentionvote.inference.fetching import access as registry_access
+from attentionvote.inference.fetching.bundles import FetchedBundles
 from attentionvote.inference.server.access import Tokens, check_host
 from attentionvote.inference.server.admission import MOST_DEADLINE_MS, Gate
 from attentionvote.inference.server.answering import Answering, Limits
 from attentionvote.inference.server.application import application
-from attentionvote.inference.server.bundle_loading import BundleLoader
 from attentionvote.inference.server.json_logs import configure, say
-from attentionvote.inference.server.last_known_good import STATE_VARIABLE, LastKnownGood, default_state
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.serving import Serving
-from attentionvote.inference.server.source import Source, source_of
-from attentionvote.inference.signature import PUBLIC_NAME, keys_folder, load_public_key
+from attentionvote.inference.server.model.bundle_loading import BundleLoader
+from attentionvote.inference.server.model.last_known_good import STATE_VARIABLE, LastKnownGood, default_state
+from attentionvote.inference.server.model.serving import Serving
+from attentionvote.inference.server.model.source import Source, source_of
 
 PORT = 8000
 # How long requests may take to end after SIGTERM, and threads after that.

@@ -1,0 +1,1 @@
+"""Bundles: what is in one, who signed it, and how it is read."""

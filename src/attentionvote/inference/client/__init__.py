@@ -1,0 +1,25 @@
+"""A client of a cell's server: numpy and the standard library, nothing else."""
+
+from attentionvote.inference.client.pose_client import (
+    Answer,
+    DeadlinePassed,
+    PoseClient,
+    PoseClientError,
+    Rejected,
+    ServerFailed,
+    Unauthorized,
+    Unavailable,
+    Unreachable,
+)
+
+__all__ = [
+    "Answer",
+    "DeadlinePassed",
+    "PoseClient",
+    "PoseClientError",
+    "Rejected",
+    "ServerFailed",
+    "Unauthorized",
+    "Unavailable",
+    "Unreachable",
+]

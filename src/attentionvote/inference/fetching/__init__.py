@@ -1,0 +1,1 @@
+"""Bundles from a registry, over plain HTTP."""

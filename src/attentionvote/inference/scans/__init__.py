@@ -1,0 +1,1 @@
+"""Scans from files and bytes: point clouds and depth images, bounded."""

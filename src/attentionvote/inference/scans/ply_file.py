@@ -1,0 +1,112 @@
+"""The vertices of a PLY file: ascii, binary little and big endian. Other properties are skipped, faces are not read."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attentionvote.inference.scans.number_rows import number_rows
+
+MAGIC = (b"ply\n", b"ply\r\n", b"ply ")
+_MOST_HEADER_BYTES, _MOST_LINES = 256 * 1024, 2000
+_END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+@dataclass
+class _Element:
+    """An element of the header: how many of it there are, its properties' names and types; a list has no type."""
+
+    name: str
+    count: int
+    properties: dict[str, str | None] = field(default_factory=dict)
+
+
+def points_from_ply(content: bytes, most_points: int) -> NDArray[np.float32]:
+    """Coordinates ``(P, 3)`` of the vertices.
+
+    Raises:
+        ValueError: with what is wrong, when the file is no PLY file, damaged or too large.
+    """
+    order, elements, start = _header(content)
+    vertex = next((element for element in elements if element.name == "vertex"), None)
+    if vertex is None:
+        raise ValueError("its header has no element vertex")
+    if missing := [axis for axis in "xyz" if axis not in vertex.properties]:
+        raise ValueError(f"its vertices must have x, y and z, got no {missing[0]}")
+    if vertex.count > most_points:
+        raise ValueError(f"it must have at most {most_points} vertices, got {vertex.count}")
+    if not vertex.count:
+        return np.zeros((0, 3), np.float32)
+    before = elements[: elements.index(vertex)]
+    if _FORMATS[order]:
+        for element in before:
+            start += element.count * _row(element, order).itemsize
+        row = _row(vertex, order)
+        there = max(len(content) - start, 0)
+        if vertex.count * row.itemsize > there:
+            raise ValueError(
+                f"its header promises {vertex.count} vertices of {row.itemsize} bytes, "
+                f"but only {there} bytes follow: it is truncated"
+            )
+        rows = np.frombuffer(content, row, vertex.count, start)
+        columns = [rows[axis] for axis in "xyz"]
+    else:
+        if None in vertex.properties.values():
+            raise ValueError("its vertices must have no list property")
+        places = [list(vertex.properties).index(axis) for axis in "xyz"]
+        skip = sum(element.count for element in before)
+        columns = list(number_rows(content[start:], skip, vertex.count, len(vertex.properties), places).T)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.stack([column.astype(np.float32) for column in columns], axis=-1)
+
+
+def _row(element: _Element, order: str) -> np.dtype:
+    """The layout of one row of an element in a binary file."""
+    if None in element.properties.values():
+        raise ValueError(f"its element {element.name} must have no list property unless it follows the vertices")
+    kinds = [(name, _FORMATS[order] + str(kind)) for name, kind in element.properties.items()]
+    return np.dtype(kinds)
+
+
+def _header(content: bytes) -> tuple[str, list[_Element], int]:
+    """Format, elements, and where the data begin."""
+    end = _END.search(content[:_MOST_HEADER_BYTES])
+    if end is None:
+        raise ValueError("its header has no end_header")
+    lines = content[: end.start()].decode("latin-1").splitlines()
+    if len(lines) > _MOST_LINES:
+        raise ValueError(f"its header must have at most {_MOST_LINES} lines, got {len(lines)}")
+    order = ""
+    elements: list[_Element] = []
+    for line in lines[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3 and words[1] in _FORMATS:
+            order = words[1]
+        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 16:
+            elements.append(_Element(words[1], int(words[2])))
+        elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
+            _add(elements[-1], words[2], _TYPES[words[1]])
+        elif words[:2] == ["property", "list"] and elements and len(words) == 5:
+            _add(elements[-1], words[4], None)
+        else:
+            raise ValueError(f"its header has the line {line[:60]!r}, which no PLY header has")
+    if not order:
+        raise ValueError(f"its header must name a format, one of {', '.join(_FORMATS)}")
+    return order, elements, end.end()
+
+
+def _add(element: _Element, name: str, kind: str | None) -> None:
+    if name in element.properties:
+        raise ValueError(f"its element {element.name} has the property {name[:40]!r} twice")
+    element.properties[name] = kind

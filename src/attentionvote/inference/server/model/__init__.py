@@ -1,0 +1,1 @@
+"""The model that serves: loading, testing, exchanging and keeping it."""

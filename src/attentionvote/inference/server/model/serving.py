@@ -1,0 +1,116 @@
+"""What serves at the moment, the one thread it works in, and how it is exchanged without a request noticing."""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from attentionvote.contract import ModelCard
+from attentionvote.inference.answer import DIGEST_LENGTH
+from attentionvote.inference.estimator import PoseEstimator
+from attentionvote.inference.fetching.reference import RegistryVersion
+from attentionvote.inference.server.json_logs import say
+from attentionvote.inference.server.metrics import Metrics
+from attentionvote.inference.server.refusal import Refusal, bad_request, nearest
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Served:
+    """A model that passed its self-test.
+
+    Attributes:
+        estimator: of the verified bundle.
+        kept: whether a copy for the next start is on the disk.
+        last_known_good: whether it came from such a copy, not from the given path.
+        origin: which registered version it is; None where it came from a path.
+    """
+
+    estimator: PoseEstimator
+    kept: bool
+    last_known_good: bool
+    origin: RegistryVersion | None = None
+
+    @property
+    def card(self) -> ModelCard:
+        """The model's card."""
+        return self.estimator.card
+
+    @property
+    def name(self) -> str:
+        """The model's name for clients: the part's."""
+        return self.card.part.name
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the bundle's manifest."""
+        return self.estimator.digest
+
+    @property
+    def version(self) -> str:
+        """The model's version for clients: the first digits of the digest."""
+        return self.digest[:DIGEST_LENGTH]
+
+
+class Serving:
+    """The model that serves. All methods are called on the event loop; the work runs in one thread, in order.
+
+    Args:
+        metrics: to be told about the model.
+    """
+
+    def __init__(self, metrics: Metrics) -> None:
+        self.current: Served | None = None
+        self.waits_for = "no bundle was loaded yet"
+        self._metrics = metrics
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="estimator")
+
+    def model(self, name: str | None = None, version: str | None = None) -> Served:
+        """The model that serves, when it is the one asked for.
+
+        Raises:
+            Refusal: 503 when there is none yet, 404 when another name or version serves.
+        """
+        served = self.current
+        if served is None:
+            raise Refusal(503, f"no model is ready: {self.waits_for}", "unavailable", {"Retry-After": "2"})
+        if name is not None and name != served.name:
+            hint = nearest(name, [served.name])
+            raise bad_request(f"model must be {served.name!r}, which is served here, got {name[:80]!r}{hint}", 404)
+        if version is not None and version != served.version:
+            raise bad_request(
+                f"version of model {served.name!r} must be {served.version!r}, which is served here, "
+                f"got {version[:80]!r}: leave the version out for whatever is served",
+                404,
+            )
+        return served
+
+    def submit(self, work: Any, *arguments: Any) -> Future[Any]:
+        """Queue work for the estimator's thread."""
+        return self._thread.submit(work, *arguments)
+
+    def swap(self, served: Served) -> None:
+        """Let another model serve. Requests that were queued before end on the old one, which is closed after them."""
+        old, self.current = self.current, served
+        self._metrics.serving(
+            served.name, served.version, served.digest, kept=served.kept, last_known_good=served.last_known_good
+        )
+        self._metrics.registered(served.origin)
+        self._metrics.ready.set(1)
+        say(
+            "model", f"{served.name} {served.version} serves",
+            part=served.name, version=served.version, digest=served.digest,
+            kept=served.kept, last_known_good=served.last_known_good, before=old.version if old else None,
+            registry=str(served.origin) if served.origin else None,
+            level=logging.WARNING if served.last_known_good or not served.kept else logging.INFO,
+        )  # fmt: skip
+        if old is not None and old.estimator is not served.estimator:
+            # One thread, first in first out: whatever was queued for the old one comes before this.
+            self._thread.submit(old.estimator.close)
+
+    def close(self) -> None:
+        """Take no more work; what is queued is dropped, what runs ends by its deadline."""
+        self._thread.shutdown(wait=False, cancel_futures=True)

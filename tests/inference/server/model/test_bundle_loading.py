@@ -1,0 +1,48 @@
+"""When a folder is worth another try."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from attentionvote.inference.bundles.bundle import load_bundle
+from attentionvote.inference.errors import BundleError
+from attentionvote.inference.estimator import PoseEstimator
+from attentionvote.inference.server.model.bundle_loading import BundleLoader, mark_of
+
+
+def test_a_mark_changes_with_anything_in_the_folder(bundle_folder: Path, trusted_key: Path, tmp_path: Path) -> None:
+    mark = mark_of(bundle_folder)
+    assert mark.digest == load_bundle(bundle_folder, trusted_key).digest
+    assert mark == mark_of(bundle_folder)
+    link = tmp_path / "latest"
+    link.symlink_to(bundle_folder)
+    assert mark_of(link) == mark
+    for change in (
+        lambda: os.utime(bundle_folder / "golden" / "cloud_0.npz", ns=(1, 1)),
+        lambda: (bundle_folder / "extra").write_text("x"),
+        lambda: os.truncate(bundle_folder / "model.onnx", 10),
+        lambda: (bundle_folder / "manifest.json").write_text("{}"),
+        lambda: (bundle_folder / "manifest.json").unlink(),
+        lambda: shutil.rmtree(bundle_folder),
+    ):
+        change()
+        assert mark_of(bundle_folder) != mark
+        mark = mark_of(bundle_folder)
+    assert mark.digest == ""
+
+
+def test_a_served_model_was_verified_and_tested(bundle_folder: Path, trusted_key: Path) -> None:
+    loader = BundleLoader(trusted_key, PoseEstimator, None)
+    served, failure = loader.from_source(bundle_folder, must_keep=True)
+    assert failure is None
+    assert not served.kept  # there is no store
+    assert (served.name, served.version) == ("bracket", served.digest[:12])
+    assert loader.last_known_good() == (None, [])
+    with (bundle_folder / "model.onnx").open("ab") as file:
+        file.write(b"x")
+    with pytest.raises(BundleError, match=r"model\.onnx must have .* bytes"):
+        loader.from_source(bundle_folder, must_keep=False)
