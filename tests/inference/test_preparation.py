@@ -45,6 +45,7 @@ LAYOUT = {"centers": [40, 20, 10, 5], "neighbors": [8, 6, 4, 2], "radii": [0.02,
 
 def test_neighbours_are_found_by_c_code_or_not_at_all(make_cloud: MakeCloud, monkeypatch: pytest.MonkeyPatch) -> None:
     points = make_cloud(300)[None]
+    assert native.load("attentionvote.geometry", "pointops.c") is not None  # as a cell's image does beforehand
     order, *neighbors = find_neighbors(points, LAYOUT)
     np.testing.assert_array_equal(order, farthest_point_order(points[0], 40))
     assert [one.shape for one in neighbors] == [(40, 8), (20, 6), (10, 4), (5, 2)]
