@@ -34,6 +34,15 @@ def read_cell(path: Path | str) -> Cell:
     Raises:
         InputError: with one sentence, when the file is missing, no JSON, or says something impossible.
     """
+    return parse_cell(cell_bytes(path))
+
+
+def cell_bytes(path: Path | str) -> bytes:
+    """The content of a cell file, checked.
+
+    Raises:
+        InputError: with one sentence, when the file is missing, no JSON, or says something impossible.
+    """
     try:
         with Path(path).open("rb") as file:
             content = file.read(_MOST_BYTES + 1)
@@ -42,9 +51,10 @@ def read_cell(path: Path | str) -> Cell:
     if len(content) > _MOST_BYTES:
         raise InputError(f"cell file {path} must have at most {_MOST_BYTES} bytes, got more")
     try:
-        return parse_cell(content)
+        parse_cell(content)
     except InputError as error:
         raise InputError(f"cell file {path}: {error}") from error
+    return content
 
 
 def parse_cell(content: bytes) -> Cell:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(ValueError):
     """What was sent or configured cannot be used: the caller must change it (HTTP 4xx, exit code 2)."""
@@ -25,3 +28,9 @@ class RegistryError(BundleError):
     def __init__(self, sentence: str, *, away: bool = False) -> None:
         super().__init__(sentence)
         self.away = away
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """``, did you mean 'x'?`` when one of the valid names is close, else nothing."""
+    found = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
+    return f", did you mean {found[0]!r}?" if found else ""

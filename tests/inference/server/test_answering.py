@@ -73,7 +73,7 @@ def test_waiting_counts_against_the_deadline(slow_server: Any, make_cloud: Any, 
         assert running.result().status == 200
 
 
-@pytest.mark.parametrize("value", ["0", "-5", "nan", "inf", "60001", "soon", "1_000", "", "٣"])
+@pytest.mark.parametrize("value", ["0", "-5", "nan", "inf", "0.99", "soon", "1_000", "", "٣"])
 def test_a_deadline_that_is_none_is_refused(shared_server: Any, make_cloud: Any, npy: Any, value: str) -> None:
     reply = shared_server.post("/poses", npy(make_cloud()), {"X-Deadline-Ms": value.encode().decode("latin-1")})
     assert reply.status == 400

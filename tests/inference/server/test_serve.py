@@ -41,7 +41,7 @@ def test_options_that_cannot_work_are_one_sentence(
         (["--token-file", str(tmp_path / "none")], "must be readable, but: No such file"),
         (["--port", "70000"], "--port must be between 0 and 65535, got 70000"),
         (["--queue", "-1"], "--queue must be between 0 and 1000, got -1"),
-        (["--deadline-ms", "nan"], "--deadline-ms must be between 1 and 60000, got nan"),
+        (["--deadline-ms", "nan"], "--deadline-ms must be between 1 and 10000, got nan"),
         (["--max-body-mb", "0"], "--max-body-mb must be between 0.001 and 1024, got 0"),
         (["--poll-s", "0"], "--poll-s must be between 0.05 and 3600, got 0"),
         (["--registry-poll-s", "0"], "--registry-poll-s must be between 0.05 and 3600, got 0"),

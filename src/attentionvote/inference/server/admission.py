@@ -9,66 +9,23 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
-from dataclasses import dataclass, field
 
 from starlette.requests import Request
 
+from attentionvote.inference.errors import InputError
+from attentionvote.inference.server.deadline import Deadline, deadline_seconds, late_answer
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.refusal import Refusal, bad_request
+from attentionvote.inference.server.worker.channel import SharedContent
 
-MOST_DEADLINE_MS = 60_000.0
 DEADLINE_HEADER, RETRY_HEADER = "X-Deadline-Ms", "X-Retry-After-Ms"
 
 
-@dataclass
-class Deadline:
-    """Seconds that a request may take, counted from its arrival.
-
-    Attributes:
-        budget_s: all of it.
-        start: of the monotonic clock.
-    """
-
-    budget_s: float
-    start: float = field(default_factory=time.monotonic)
-
-    def remaining_s(self) -> float:
-        """What is left; negative when it has passed."""
-        return self.start + self.budget_s - time.monotonic()
-
-    def elapsed_s(self) -> float:
-        """What has been used."""
-        return time.monotonic() - self.start
-
-    def exceeded(self, doing: str) -> Refusal:
-        """The answer when it has passed while something was done."""
-        sentence = f"the deadline of {self.budget_s * 1e3:.0f} ms passed while {doing}: nothing was computed to its end"
-        content = {"answer": "abstention", "reason": "deadline_exceeded", "message": sentence, "poses": []}
-        return Refusal(504, sentence, "deadline", content=content)
-
-
-def deadline_of(what: str, given_ms: float, start: float | None = None) -> Deadline:
-    """A deadline from a client's number.
-
-    Args:
-        what: names the header or parameter in the sentence.
-        given_ms: the number.
-        start: when the request arrived; now when None.
-
-    Raises:
-        Refusal: when it is out of range.
-    """
-    if not (math.isfinite(given_ms) and 1.0 <= given_ms <= MOST_DEADLINE_MS):
-        raise bad_request(f"{what} must be between 1 and {MOST_DEADLINE_MS:.0f} milliseconds, got {given_ms:g}")
-    return Deadline(given_ms / 1e3) if start is None else Deadline(given_ms / 1e3, start)
-
-
-def deadline_from_header(request: Request, default_ms: float) -> Deadline:
+def deadline_from_header(request: Request, default_ms: float, most_ms: float) -> Deadline:
     """The deadline of ``X-Deadline-Ms``, or the server's own.
 
     Raises:
-        Refusal: when the header is no number in range.
+        InputError: when the header is no number in range.
     """
     text = request.headers.get(DEADLINE_HEADER)
     if text is None:
@@ -78,8 +35,14 @@ def deadline_from_header(request: Request, default_ms: float) -> Deadline:
             raise ValueError
         number = float(text)
     except ValueError:
-        raise bad_request(f"{DEADLINE_HEADER} must be a number of milliseconds, got {text[:40]!r}") from None
-    return deadline_of(DEADLINE_HEADER, number)
+        raise InputError(f"{DEADLINE_HEADER} must be a number of milliseconds, got {text[:40]!r}") from None
+    return Deadline(deadline_seconds(DEADLINE_HEADER, number, most_ms))
+
+
+def too_late(deadline: Deadline, doing: str) -> Refusal:
+    """The answer when a deadline has passed while something was done."""
+    sentence = deadline.sentence(doing)
+    return Refusal(504, sentence, "deadline", content=late_answer(sentence))
 
 
 class Place:
@@ -137,8 +100,8 @@ class Gate:
         self._typical_s += 0.2 * (seconds - self._typical_s)
 
 
-async def read_body(request: Request, most_bytes: int, deadline: Deadline) -> bytes:
-    """The body, refused as soon as it is known to be too large.
+async def read_body(request: Request, most_bytes: int, deadline: Deadline) -> SharedContent:
+    """The body in shared memory, refused as soon as it is known to be too large. Whoever gets it closes it.
 
     Raises:
         Refusal: 413 beyond ``most_bytes``, 415 for a content encoding, 504 when the deadline passes first.
@@ -150,17 +113,20 @@ async def read_body(request: Request, most_bytes: int, deadline: Deadline) -> by
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared[:20]) > most_bytes:
         raise _too_large(most_bytes, f"{declared[:20]}")
-    chunks, size = [], 0
+    content = SharedContent()
     try:
         async with asyncio.timeout(max(deadline.remaining_s(), 0.0)):
             async for chunk in request.stream():
-                size += len(chunk)
-                if size > most_bytes:
+                if content.size + len(chunk) > most_bytes:
                     raise _too_large(most_bytes, "more")
-                chunks.append(chunk)
+                content.write(chunk)
     except TimeoutError:
-        raise deadline.exceeded("the body was received") from None
-    return b"".join(chunks)
+        content.close()
+        raise too_late(deadline, "the body was received") from None
+    except BaseException:
+        content.close()
+        raise
+    return content
 
 
 def _too_large(most_bytes: int, got: str) -> Refusal:

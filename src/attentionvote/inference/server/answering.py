@@ -1,55 +1,28 @@
-"""One request for poses, from its first byte to the estimator's answer: admitted, received, queued, run, in time."""
+"""One request for poses, from its first byte to the worker's answer: admitted, received, queued, run, in time."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
 
-from attentionvote.inference.answer import Abstention, Estimate
-from attentionvote.inference.errors import InputError
-from attentionvote.inference.server.admission import (
-    Deadline,
-    Gate,
-    Place,
-    deadline_from_header,
-    deadline_of,
-    read_body,
-)
+from attentionvote.inference.server.admission import Gate, Place, deadline_from_header, read_body, too_late
+from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.serving import Served, Serving
-from attentionvote.inference.server.refusal import bad_request
+from attentionvote.inference.server.refusal import Refusal
+from attentionvote.inference.server.worker.channel import Message, SharedContent
+from attentionvote.inference.server.worker.process import WorkerLost
 
-# The estimator stops itself at the deadline; this long its own answer about that is waited for.
+# A job stops itself at its deadline; this long its own answer about that is waited for.
 _GRACE_S = 0.05
-
-
-class Question(NamedTuple):
-    """What a body asks.
-
-    Attributes:
-        arguments: of ``PoseEstimator.estimate``.
-        deadline_ms: given in the body; None without.
-        request: the parsed request, for the answer's form.
-    """
-
-    arguments: Mapping[str, Any]
-    deadline_ms: float | None = None
-    request: Any = None
-
-
-class Reply(NamedTuple):
-    """An answer, the model that gave it, and what was asked."""
-
-    answer: Estimate | Abstention
-    served: Served
-    question: Question
 
 
 @dataclass
@@ -58,6 +31,7 @@ class Record:
 
     points: int | None = None
     detections: int | None = None
+    withheld: int | None = None
     reason: str | None = None
     outcome: str | None = None
     error: str | None = None
@@ -70,11 +44,17 @@ class Limits:
 
     Attributes:
         deadline_ms: when the client names none.
+        most_deadline_ms: that a client may name.
         most_body_bytes: of a request.
     """
 
     deadline_ms: float
+    most_deadline_ms: float
     most_body_bytes: int
+
+
+class WorkerFailed(RuntimeError):
+    """A defect: the worker met an error that nobody foresaw. The text is its traceback."""
 
 
 class Answering:
@@ -91,17 +71,13 @@ class Answering:
         self.serving, self.gate, self.limits, self.metrics = serving, gate, limits, metrics
 
     async def ask(
-        self,
-        request: Request,
-        read: Callable[[bytes], Question],
-        name: str | None = None,
-        version: str | None = None,
-    ) -> Reply:
+        self, request: Request, job: Mapping[str, Any], name: str | None = None, version: str | None = None
+    ) -> Response:
         """Answer one request.
 
         Args:
             request: its body not yet read.
-            read: makes the question of the body, in the estimator's thread; raises InputError.
+            job: what a worker does with the body, see ``worker.jobs``.
             name, version: of the model asked for; None: whatever serves.
 
         Raises:
@@ -109,96 +85,105 @@ class Answering:
             ClientDisconnect: nobody waits for the answer any more.
         """
         record: Record = request.state.record
-        deadline = deadline_from_header(request, self.limits.deadline_ms)
+        limits = self.limits
+        deadline = deadline_from_header(request, limits.deadline_ms, limits.most_deadline_ms)
         self.serving.model(name, version)  # before a body is received for a model that is not there
         place = self.gate.enter()
+        content = None
         try:
-            body = await read_body(request, self.limits.most_body_bytes, deadline)
+            content = await read_body(request, limits.most_body_bytes, deadline)
             self._took(record, "receive", deadline.elapsed_s())
             served = self.serving.model(name, version)
-            job = _Job(served, read, body, deadline, record)
-            future = self.serving.submit(job.run)
+            work = _Work(served, {**job, "most_deadline_ms": limits.most_deadline_ms}, content, deadline, record)
+            future = self.serving.submit(work.run)
         except BaseException:
             place.leave()
+            if content is not None:
+                content.close()
             raise
-        _leave_when_done(place, future)
+        _leave_when_done(place, content, future)
         answer = await self._wait(request, future, deadline)
         for stage in ("queue", "parse", "estimate"):
-            self._took(record, stage, record.seconds[stage])
-        self.gate.took(record.seconds["parse"] + record.seconds["estimate"])
-        assert job.question is not None
-        return self._judge(Reply(answer, served, job.question), record)
+            if stage in record.seconds:
+                self._took(record, stage, record.seconds[stage])
+        self.gate.took(sum(record.seconds.get(stage, 0.0) for stage in ("parse", "estimate")))
+        return self._response(answer, record)
 
-    async def _wait(self, request: Request, future: Future[Any], deadline: Deadline) -> Estimate | Abstention:
+    async def _wait(self, request: Request, future: Future[Message], deadline: Deadline) -> Message:
         """The answer, unless the deadline passes or the client leaves first: then nobody waits for it any more."""
-        answer: asyncio.Future[Any] = asyncio.wrap_future(future)
+        answer: asyncio.Future[Message] = asyncio.wrap_future(future)
         gone: asyncio.Future[Any] = asyncio.ensure_future(_disconnected(request))
         try:
             while True:
                 left = deadline.remaining_s() + _GRACE_S
                 done, _ = await asyncio.wait({answer, gone}, timeout=left, return_when=asyncio.FIRST_COMPLETED)
                 if answer in done:
-                    result: Estimate | Abstention = answer.result()
-                    return result
+                    return answer.result()
                 if gone in done:
                     raise ClientDisconnect
                 if deadline.remaining_s() <= 0:  # else the body has just named a longer one
-                    raise deadline.exceeded("the request waited or was worked on")
-        except InputError as error:
-            raise bad_request(str(error)) from error
+                    raise too_late(deadline, "the request waited or was worked on")
         finally:
             gone.cancel()
-            answer.cancel()  # takes it out of the queue; what runs already ends by its deadline
+            answer.cancel()  # takes it out of the queue; what runs already ends by its deadline, or is ended
 
-    def _judge(self, reply: Reply, record: Record) -> Reply:
-        """Count an answer; one that came too late is an error for the client."""
-        answer = reply.answer
-        record.points = answer.points_given
-        record.detections = len(answer.detections) if isinstance(answer, Estimate) else 0
-        if isinstance(answer, Abstention):
-            record.reason = answer.reason
-            if answer.reason == "deadline_exceeded":
-                refusal = bad_request(answer.message, 504)
-                refusal.outcome, refusal.content = "deadline", answer.to_dict()
-                raise refusal
-        self.metrics.detections.observe(record.detections)
-        record.outcome = "ok" if isinstance(answer, Estimate) else "abstained"
-        return reply
+    def _response(self, answer: Message, record: Record) -> Response:
+        """The answer as it is sent; what a worker refused is refused."""
+        head = answer.head
+        record.outcome, record.error = head["outcome"], head.get("error")
+        record.reason, record.points, record.detections = head.get("reason"), head.get("points"), head.get("detections")
+        record.withheld = head.get("withheld") or None
+        if head["status"] != 200:
+            if "trace" in head:
+                raise WorkerFailed(head["trace"])
+            raise Refusal(head["status"], head["error"], head["outcome"], content=head.get("abstention"))
+        if record.detections is not None:
+            self.metrics.detections.observe(record.detections)
+        self.metrics.withheld.inc(record.withheld or 0)
+        return Response(bytes(answer.content), headers=head["headers"])
 
     def _took(self, record: Record, stage: str, seconds: float) -> None:
         record.seconds[stage] = seconds
         self.metrics.seconds.labels(stage).observe(seconds)
 
 
-class _Job:
-    """The part of a request that runs in the estimator's thread."""
+class _Work:
+    """The part of a request that the thread which asks workers waits for."""
 
     def __init__(
-        self, served: Served, read: Callable[[bytes], Question], body: bytes, deadline: Deadline, record: Record
+        self, served: Served, job: dict[str, Any], content: SharedContent, deadline: Deadline, record: Record
     ) -> None:
-        self.question: Question | None = None
-        self._served, self._read, self._body = served, read, body
+        self._served, self._job, self._content = served, job, content
         self._deadline, self._record = deadline, record
         self._queued = time.monotonic()
 
-    def run(self) -> Estimate | Abstention:
-        """Parse and estimate; Refusal and InputError reach the client."""
-        begun = time.monotonic()
+    def run(self) -> Message:
+        """Let a worker do it; a Refusal reaches the client."""
         seconds = self._record.seconds
-        seconds["queue"] = begun - self._queued
+        seconds["queue"] = time.monotonic() - self._queued
         if self._deadline.remaining_s() <= 0:
-            raise self._deadline.exceeded("the request waited in the queue")
-        question = self.question = self._read(self._body)
-        self._body = b""
-        if question.deadline_ms is not None:
-            given = deadline_of("parameter deadline_ms", question.deadline_ms, self._deadline.start)
-            self._deadline.budget_s = given.budget_s
-        parsed = time.monotonic()
-        seconds["parse"] = parsed - begun
-        left = max(self._deadline.remaining_s(), 0.0)
-        answer = self._served.estimator.estimate(**question.arguments, deadline_s=left)
-        seconds["estimate"] = time.monotonic() - parsed
+            raise too_late(self._deadline, "the request waited in the queue")
+        try:
+            answer = self._served.workers.ask(self._job, self._content, self._deadline)
+        except WorkerLost as loss:
+            raise _lost(loss, self._deadline) from None
+        if answer is None:
+            raise too_late(self._deadline, "a lost worker was replaced")
+        seconds |= answer.head["seconds"]
         return answer
+
+
+def _lost(loss: WorkerLost, deadline: Deadline) -> Refusal:
+    """What the client is told whose request took its worker with it."""
+    if loss.reason == "deadline":
+        return too_late(deadline, "the request was worked on, and its worker was ended")
+    if loss.reason == "memory":
+        sentence = (
+            "the body must be readable within this server's memory, but its worker was ended for taking more: "
+            "crop or thin the cloud out"
+        )
+        return Refusal(422, sentence, "rejected")
+    return Refusal(500, "the worker ended while it worked on this request: the server's log says how", "failed")
 
 
 async def _disconnected(request: Request) -> None:
@@ -207,11 +192,12 @@ async def _disconnected(request: Request) -> None:
         pass
 
 
-def _leave_when_done(place: Place, future: Future[Any]) -> None:
-    """Free a place when the work has ended, in whichever thread that is."""
+def _leave_when_done(place: Place, content: SharedContent, future: Future[Message]) -> None:
+    """Free place and body when the work has ended, in whichever thread that is."""
     loop = asyncio.get_running_loop()
 
-    def leave(_: Future[Any]) -> None:
+    def leave(_: Future[Message]) -> None:
+        content.close()
         with suppress(RuntimeError):  # the loop has ended: the server is gone
             loop.call_soon_threadsafe(place.leave)
 

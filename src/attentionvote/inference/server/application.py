@@ -17,17 +17,14 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from attentionvote.inference.cell import Cell
-from attentionvote.inference.errors import InputError
-from attentionvote.inference.scans.cloud_files import read_cloud
-from attentionvote.inference.scans.depth_files import PNG_MAGIC, read_depth
+from attentionvote.inference.errors import InputError, nearest
 from attentionvote.inference.server.access import Tokens
-from attentionvote.inference.server.answering import Answering, Question
+from attentionvote.inference.server.answering import Answering
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.reloading import Watch
 from attentionvote.inference.server.protocol.routes import ProtocolRoutes, registered
-from attentionvote.inference.server.refusal import Refusal, bad_request, nearest
+from attentionvote.inference.server.refusal import Refusal, bad_request
 from attentionvote.inference.server.request_log import RequestLog
 
 DOCUMENTATION = "docs/operating-a-cell.md"
@@ -37,20 +34,17 @@ _PATHS = (
 )  # fmt: skip
 
 
-def application(
-    answering: Answering, watch: Watch, metrics: Metrics, cell: Cell, tokens: Tokens | None, version: str
-) -> Starlette:
+def application(answering: Answering, watch: Watch, metrics: Metrics, tokens: Tokens | None, version: str) -> Starlette:
     """The ASGI application.
 
     Args:
         answering: answers requests for poses.
         watch: runs while the application does.
         metrics: of ``/metrics``.
-        cell: its camera makes clouds of depth images.
         tokens: accepted; None: no token is asked for.
         version: of the server.
     """
-    pages = _Pages(answering, metrics, cell, version)
+    pages = _Pages(answering, metrics, version)
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
@@ -81,8 +75,8 @@ def application(
 class _Pages:
     """The endpoints that belong to no protocol."""
 
-    def __init__(self, answering: Answering, metrics: Metrics, cell: Cell, version: str) -> None:
-        self._answering, self._metrics, self._cell, self._version = answering, metrics, cell, version
+    def __init__(self, answering: Answering, metrics: Metrics, version: str) -> None:
+        self._answering, self._metrics, self._version = answering, metrics, version
 
     async def itself(self, _: Request) -> Response:
         """What is served here and where to read on."""
@@ -103,22 +97,11 @@ class _Pages:
 
     async def poses(self, request: Request) -> Response:
         """Poses of the cloud or depth image that the body is."""
-        reply = await self._answering.ask(request, self._read)
-        return JSONResponse(reply.answer.to_dict())
+        return await self._answering.ask(request, {"kind": "file"})
 
     async def metrics(self, _: Request) -> Response:
         """Prometheus' text."""
         return Response(self._metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
-
-    def _read(self, body: bytes) -> Question:
-        if not body.startswith(PNG_MAGIC):
-            return Question({"points": read_cloud(body, "the body")})
-        camera = self._cell.camera
-        if camera is None:
-            raise InputError(
-                "a depth image needs its camera, got none: start the server with --cell and a camera in it"
-            )
-        return Question({"depth": read_depth(body, "the body"), "camera": camera})
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

@@ -17,6 +17,7 @@ STAGES = ("receive", "parse", "queue", "estimate", "total")
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0)
 DETECTIONS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
 RELOADS = ("loaded", "refused", "failed", "last_known_good")
+LOSSES = ("deadline", "memory", "crashed")
 POLLS = ("answered", "away", "refused", "failed")
 ABSTENTIONS = ("too_few_points", "nothing_found", "deadline_exceeded")
 
@@ -45,7 +46,19 @@ class Metrics:
         self.detections = Histogram(
             prefix + "detections", "Poses in an answer", buckets=DETECTIONS, registry=self.registry
         )
-        self.ready = Gauge(prefix + "ready", "1 when a verified and self-tested model serves", registry=self.registry)
+        self.withheld = Counter(
+            prefix + "poses_withheld", "Poses that could not be where the scan was measured", registry=self.registry
+        )
+        self.ready = Gauge(
+            prefix + "ready", "1 when a tested model serves and one of its workers can answer", registry=self.registry
+        )
+        self.workers_lost = Counter(
+            prefix + "workers_lost", "Worker processes that were ended or ended, by reason", ["reason"],
+            registry=self.registry,
+        )  # fmt: skip
+        self.worker_memory = Gauge(
+            prefix + "worker_memory_bytes", "Resident memory of the worker processes", registry=self.registry
+        )
         self.model = Gauge(
             prefix + "model_info", "The model that serves", ["part", "version", "digest"], registry=self.registry
         )
@@ -90,6 +103,8 @@ class Metrics:
             self.abstentions.labels(reason)
         for outcome in POLLS:
             self.registry_polls.labels(outcome)
+        for reason in LOSSES:
+            self.workers_lost.labels(reason)
         for outcome in RELOADS:
             self.reloads.labels(outcome)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from starlette.responses import JSONResponse
@@ -43,9 +42,3 @@ class Refusal(Exception):
 def bad_request(sentence: str, status: int = 400) -> Refusal:
     """A refusal that is the client's to mend."""
     return Refusal(status, sentence, "rejected")
-
-
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """``, did you mean 'x'?`` when one of the valid names is close, else nothing."""
-    found = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
-    return f", did you mean {found[0]!r}?" if found else ""

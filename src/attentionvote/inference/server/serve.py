@@ -20,13 +20,12 @@ import uvicorn
 
 from attentionvote.inference.bundles.bundle import Bundle
 from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder, load_public_key
-from attentionvote.inference.cell import Cell, read_cell
+from attentionvote.inference.cell import cell_bytes
 from attentionvote.inference.errors import BundleError, InputError
-from attentionvote.inference.estimator import PoseEstimator
 from attentionvote.inference.fetching import access as registry_access
 from attentionvote.inference.fetching.bundles import FetchedBundles
 from attentionvote.inference.server.access import Tokens, check_host
-from attentionvote.inference.server.admission import MOST_DEADLINE_MS, Gate
+from attentionvote.inference.server.admission import Gate
 from attentionvote.inference.server.answering import Answering, Limits
 from attentionvote.inference.server.application import application
 from attentionvote.inference.server.json_logs import configure, say
@@ -35,6 +34,8 @@ from attentionvote.inference.server.model.bundle_loading import BundleLoader
 from attentionvote.inference.server.model.last_known_good import STATE_VARIABLE, LastKnownGood, default_state
 from attentionvote.inference.server.model.serving import Serving
 from attentionvote.inference.server.model.source import Source, source_of
+from attentionvote.inference.server.worker.process import WorkerSettings
+from attentionvote.inference.server.worker.workers import Workers
 
 PORT = 8000
 # How long requests may take to end after SIGTERM, and threads after that.
@@ -42,6 +43,7 @@ _DRAIN_S, _THREADS_S = 10, 3.0
 _MOST_CONNECTIONS = 256
 _KEEP_ALIVE_S = 75
 _MEBIBYTE = 1024 * 1024
+_MAX_DEADLINE_MS = 10_000.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--threads", type=int, default=1, help="processor threads of an estimate, default 1")
     add("--queue", type=int, default=2, help="requests that may wait beside the running one, default 2")
     add("--deadline-ms", type=float, default=2000.0, help="of requests that name none, default 2000")
+    add("--max-deadline-ms", type=float, help="longest that a request may name, default 10000 or --deadline-ms")
+    add("--job-memory-mb", type=float, default=768.0, help="memory of one request's work in MiB, default 768")
+    add("--self-test-s", type=float, default=60.0, help="seconds for loading and testing a bundle, default 60")
     add("--max-body-mb", type=float, default=64.0, help="largest request body in MiB, default 64")
     add("--poll-s", type=float, default=2.0, help="seconds between two looks at the bundle's path, default 2")
     registry_access.add_arguments(parser)
@@ -103,7 +108,7 @@ class _Settings:
     source: Source
     bundles: FetchedBundles | None
     loader: BundleLoader
-    cell: Cell
+    metrics: Metrics
     tokens: Tokens | None
     tls: bool
 
@@ -117,7 +122,12 @@ def _checked(options: argparse.Namespace) -> _Settings:
     _check_range("--port", options.port, 0, 65535)
     _check_range("--threads", options.threads, 1, 1024)
     _check_range("--queue", options.queue, 0, 1000)
-    _check_range("--deadline-ms", options.deadline_ms, 1, MOST_DEADLINE_MS)
+    if options.max_deadline_ms is None:
+        options.max_deadline_ms = max(_MAX_DEADLINE_MS, options.deadline_ms)
+    _check_range("--max-deadline-ms", options.max_deadline_ms, 1, 3_600_000)
+    _check_range("--deadline-ms", options.deadline_ms, 1, options.max_deadline_ms)
+    _check_range("--job-memory-mb", options.job_memory_mb, 64, 65_536)
+    _check_range("--self-test-s", options.self_test_s, 1, 3600)
     _check_range("--max-body-mb", options.max_body_mb, 0.001, 1024)
     _check_range("--poll-s", options.poll_s, 0.05, 3600)
     _check_range("--registry-poll-s", options.registry_poll_s, 0.05, 3600)
@@ -134,7 +144,7 @@ def _checked(options: argparse.Namespace) -> _Settings:
             raise InputError(
                 f"--tls-cert and --tls-key must be a PEM certificate and its key, but they cannot be loaded: {error}"
             ) from error
-    cell = read_cell(options.cell) if options.cell is not None else Cell()
+    cell = cell_bytes(options.cell) if options.cell is not None else b""
     trusted = load_public_key(options.key if options.key is not None else keys_folder() / PUBLIC_NAME)
     state = options.state if options.state is not None else default_state(source.name)
     store, problem = None, ""
@@ -146,11 +156,15 @@ def _checked(options: argparse.Namespace) -> _Settings:
         )
     bundles = source.bundles(state, trusted)
 
-    def make_estimator(bundle: Bundle) -> PoseEstimator:
-        return PoseEstimator(bundle, threads=options.threads, crop=cell.crop)
+    metrics = Metrics()
+    memory = int(options.job_memory_mb * _MEBIBYTE)
+    workers = WorkerSettings(options.threads, cell, memory, options.self_test_s)
 
-    loader = BundleLoader(trusted, make_estimator, store, None if bundles is None else bundles.origin_of)
-    return _Settings(problem, source, bundles, loader, cell, tokens, options.tls_cert is not None)
+    def start_workers(bundle: Bundle, polite: bool) -> Workers:
+        return Workers(bundle, workers, polite=polite, lost=lambda reason: metrics.workers_lost.labels(reason).inc())
+
+    loader = BundleLoader(trusted, start_workers, store, None if bundles is None else bundles.origin_of)
+    return _Settings(problem, source, bundles, loader, metrics, tokens, options.tls_cert is not None)
 
 
 def _check_range(name: str, value: float, least: float, most: float) -> None:
@@ -173,13 +187,13 @@ def _listen(host: str, port: int) -> socket.socket:
 
 def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.socket) -> None:
     version = importlib.metadata.version("attentionvote")
-    metrics = Metrics()
+    metrics = settings.metrics
     serving = Serving(metrics)
     polls = options.poll_s, options.registry_poll_s
     watch = settings.source.watch(settings.bundles, settings.loader, serving, metrics, *polls)
-    limits = Limits(options.deadline_ms, int(options.max_body_mb * _MEBIBYTE))
+    limits = Limits(options.deadline_ms, options.max_deadline_ms, int(options.max_body_mb * _MEBIBYTE))
     answering = Answering(serving, Gate(options.queue, metrics), limits, metrics)
-    app = application(answering, watch, metrics, settings.cell, settings.tokens, version)
+    app = application(answering, watch, metrics, settings.tokens, version)
     scheme = "https" if settings.tls else "http"
     host, port = listener.getsockname()[:2]
     url = f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"

@@ -10,8 +10,9 @@ import pytest
 
 from attentionvote.inference.bundles.bundle import load_bundle
 from attentionvote.inference.errors import BundleError
-from attentionvote.inference.estimator import PoseEstimator
 from attentionvote.inference.server.model.bundle_loading import BundleLoader, mark_of
+from attentionvote.inference.server.worker.process import WorkerSettings
+from attentionvote.inference.server.worker.workers import Workers
 
 
 def test_a_mark_changes_with_anything_in_the_folder(bundle_folder: Path, trusted_key: Path, tmp_path: Path) -> None:
@@ -36,10 +37,11 @@ def test_a_mark_changes_with_anything_in_the_folder(bundle_folder: Path, trusted
 
 
 def test_a_served_model_was_verified_and_tested(bundle_folder: Path, trusted_key: Path) -> None:
-    loader = BundleLoader(trusted_key, PoseEstimator, None)
+    loader = BundleLoader(trusted_key, lambda bundle, _: Workers(bundle, WorkerSettings()), None)
     served, failure = loader.from_source(bundle_folder, must_keep=True)
     assert failure is None
     assert not served.kept  # there is no store
+    served.workers.close()
     assert (served.name, served.version) == ("bracket", served.digest[:12])
     assert loader.last_known_good() == (None, [])
     with (bundle_folder / "model.onnx").open("ab") as file:

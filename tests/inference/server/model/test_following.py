@@ -14,7 +14,6 @@ import pytest
 
 from attentionvote.inference.bundles.bundle import load_bundle, write_manifest
 from attentionvote.inference.bundles.signature import load_private_key, load_public_key, make_keys
-from attentionvote.inference.estimator import PoseEstimator
 from attentionvote.inference.fetching.access import Access
 from attentionvote.inference.fetching.bundles import FetchedBundles
 from attentionvote.inference.fetching.reference import parse_reference
@@ -25,6 +24,8 @@ from attentionvote.inference.server.model.bundle_loading import BundleLoader
 from attentionvote.inference.server.model.following import Following
 from attentionvote.inference.server.model.reloading import BundleWatch
 from attentionvote.inference.server.model.serving import Serving
+from attentionvote.inference.server.worker.process import WorkerSettings
+from attentionvote.inference.server.worker.workers import Workers
 
 Make = Callable[..., Path]
 pytestmark = pytest.mark.slow  # the first one starts an MLflow server
@@ -237,7 +238,9 @@ def test_the_longer_it_is_away_the_rarer_it_is_asked(trusted_key: Path, free_por
     async def waits() -> list[float]:
         metrics = Metrics()
         serving = Serving(metrics)
-        watch = BundleWatch(fetched.link, BundleLoader(key, PoseEstimator, None), serving, metrics)
+        watch = BundleWatch(
+            fetched.link, BundleLoader(key, lambda bundle, _: Workers(bundle, WorkerSettings()), None), serving, metrics
+        )
         following = Following(Registry(Access(f"http://127.0.0.1:{free_port}")), fetched, watch, serving, metrics)
         found = [await following._step() for _ in range(5)]
         assert serving.waits_for == following.problem

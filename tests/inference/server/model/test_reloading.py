@@ -19,12 +19,13 @@ import numpy as np
 import pytest
 
 from attentionvote.inference.bundles.signature import load_private_key, make_keys
-from attentionvote.inference.estimator import PoseEstimator
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.bundle_loading import BundleLoader
 from attentionvote.inference.server.model.last_known_good import LastKnownGood
 from attentionvote.inference.server.model.reloading import BundleWatch
 from attentionvote.inference.server.model.serving import Served, Serving
+from attentionvote.inference.server.worker.process import WorkerSettings
+from attentionvote.inference.server.worker.workers import Workers
 
 Make = Callable[..., Path]
 LARGE = 8 * 1024 * 1024
@@ -311,9 +312,9 @@ def test_a_path_that_hangs_does_not_keep_the_cell_from_starting(
 
     source = make_bundle()
     store = LastKnownGood(tmp_path / "state")
-    loader = Hanging(trusted_key, PoseEstimator, store)
-    bundle, estimator = loader.tested(source)
-    estimator.close()
+    loader = Hanging(trusted_key, lambda bundle, _: Workers(bundle, WorkerSettings()), store)
+    bundle, workers = loader.tested(source)
+    workers.close()
     store.keep(source, bundle, trusted_key)
 
     async def start() -> tuple[bool, bool]:

@@ -13,11 +13,10 @@ from attentionvote.inference.answer import DIGEST_LENGTH
 from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.bundles.manifest import MANIFEST, MOST_MANIFEST_BYTES, files_in, opened, read_file
 from attentionvote.inference.errors import BundleError
-from attentionvote.inference.estimator import PoseEstimator
 from attentionvote.inference.fetching.reference import RegistryVersion
-from attentionvote.inference.golden import self_test
 from attentionvote.inference.server.model.last_known_good import LastKnownGood
 from attentionvote.inference.server.model.serving import Served
+from attentionvote.inference.server.worker.workers import Workers
 
 
 class Mark(NamedTuple):
@@ -55,19 +54,19 @@ class BundleLoader:
 
     Attributes:
         trusted: the key that must have signed a bundle.
-        make_estimator: of a verified bundle.
+        start_workers: with a verified bundle, which they test; politely when another model serves.
         store: where what served well is kept; None when it cannot be kept anywhere.
         origin_of: the registry's version that a digest is, where bundles come from a registry; what has none may not
             serve. None where they come from a path.
     """
 
     trusted: Trusted
-    make_estimator: Callable[[Bundle], PoseEstimator]
+    start_workers: Callable[[Bundle, bool], Workers]
     store: LastKnownGood | None
     origin_of: Callable[[str], RegistryVersion | None] | None = None
 
-    def tested(self, folder: Path) -> tuple[Bundle, PoseEstimator]:
-        """A verified bundle and an estimator that reproduced every golden cloud of it.
+    def tested(self, folder: Path, *, polite: bool = False) -> tuple[Bundle, Workers]:
+        """A verified bundle and workers that reproduced every golden cloud of it.
 
         Raises:
             BundleError: with the first thing that is wrong.
@@ -78,13 +77,7 @@ class BundleLoader:
                 f"{folder} must hold a bundle that the registry named, got {bundle.digest[:DIGEST_LENGTH]}, which it "
                 "did not under this reference"
             )
-        estimator = self.make_estimator(bundle)
-        problems = self_test(estimator, bundle)
-        if problems:
-            estimator.close()
-            more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-            raise BundleError(f"{folder}: the self-test failed: {problems[0]}{more}: export the bundle again")
-        return bundle, estimator
+        return bundle, self.start_workers(bundle, polite)
 
     def from_source(self, source: Path, *, must_keep: bool) -> tuple[Served, OSError | None]:
         """The model of the served path, and why it could not be kept (None: it was, or there is no store).
@@ -97,18 +90,18 @@ class BundleLoader:
             BundleError: when it may not serve.
             OSError: when it could not be kept, but must be.
         """
-        bundle, estimator = self.tested(source)
+        bundle, workers = self.tested(source, polite=must_keep)
         failure = None
         try:
             if self.store is not None:
                 self.store.keep(source, bundle, self.trusted)
         except OSError as error:
             if must_keep:
-                estimator.close()
+                workers.close()
                 raise
             failure = error
         kept = self.store is not None and failure is None
-        return Served(estimator, kept, last_known_good=False, origin=self._origin(bundle)), failure
+        return Served(workers, kept, last_known_good=False, origin=self._origin(bundle)), failure
 
     def keep(self, source: Path, digest: str) -> bool:
         """Keep a bundle that serves already; False when the path holds another by now.
@@ -128,11 +121,11 @@ class BundleLoader:
         problems = []
         for entry in self.store.entries() if self.store is not None else []:
             try:
-                bundle, estimator = self.tested(entry)
+                bundle, workers = self.tested(entry)
             except (BundleError, OSError) as error:
                 problems.append(str(error))
             else:
-                return Served(estimator, kept=True, last_known_good=True, origin=self._origin(bundle)), problems
+                return Served(workers, kept=True, last_known_good=True, origin=self._origin(bundle)), problems
         return None, problems
 
     def _origin(self, bundle: Bundle) -> RegistryVersion | None:

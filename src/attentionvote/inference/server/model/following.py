@@ -22,8 +22,9 @@ from attentionvote.inference.fetching.reference import RegistryVersion
 from attentionvote.inference.fetching.registry import Registry
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.model.reloading import BundleWatch, be_polite
+from attentionvote.inference.server.model.reloading import BundleWatch
 from attentionvote.inference.server.model.serving import Serving
+from attentionvote.inference.server.priority import be_polite
 
 _LONGEST_AWAY_S, _LONGEST_RETRY_S = 60.0, 300.0
 _MOST_TOLD = 100

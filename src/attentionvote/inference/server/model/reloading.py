@@ -9,12 +9,9 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-import os
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -23,11 +20,10 @@ from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.bundle_loading import BundleLoader, Mark, mark_of
 from attentionvote.inference.server.model.serving import Served, Serving
+from attentionvote.inference.server.priority import be_polite
 
 T = TypeVar("T")
 _FIRST_RETRY_S, _LAST_RETRY_S = 2.0, 300.0  # the same bundle again: disks get free, networks come back
-# Threads of this politeness leave the processor to requests: a self-test costs as much as several of them.
-_NICE = 5
 
 
 class Watch(Protocol):
@@ -198,10 +194,3 @@ class BundleWatch:
 
     async def _blocking(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, lambda: work(*arguments, **named))
-
-
-def be_polite() -> None:
-    """Let this thread give way to requests."""
-    thread = threading.get_native_id()  # Linux schedules threads like processes
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19))

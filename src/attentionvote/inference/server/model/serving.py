@@ -1,4 +1,4 @@
-"""What serves at the moment, the one thread it works in, and how it is exchanged without a request noticing."""
+"""The model that serves, the thread that asks its workers, and the exchange of models that no request notices."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any, TypeVar
 
 from attentionvote.contract import ModelCard
 from attentionvote.inference.answer import DIGEST_LENGTH
-from attentionvote.inference.estimator import PoseEstimator
+from attentionvote.inference.errors import nearest
 from attentionvote.inference.fetching.reference import RegistryVersion
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.refusal import Refusal, bad_request, nearest
+from attentionvote.inference.server.refusal import Refusal, bad_request
+from attentionvote.inference.server.worker.workers import Workers
 
 T = TypeVar("T")
 
@@ -23,13 +24,13 @@ class Served:
     """A model that passed its self-test.
 
     Attributes:
-        estimator: of the verified bundle.
+        workers: with the verified bundle.
         kept: whether a copy for the next start is on the disk.
         last_known_good: whether it came from such a copy, not from the given path.
         origin: which registered version it is; None where it came from a path.
     """
 
-    estimator: PoseEstimator
+    workers: Workers
     kept: bool
     last_known_good: bool
     origin: RegistryVersion | None = None
@@ -37,7 +38,7 @@ class Served:
     @property
     def card(self) -> ModelCard:
         """The model's card."""
-        return self.estimator.card
+        return self.workers.card
 
     @property
     def name(self) -> str:
@@ -47,7 +48,7 @@ class Served:
     @property
     def digest(self) -> str:
         """sha256 of the bundle's manifest."""
-        return self.estimator.digest
+        return self.workers.digest
 
     @property
     def version(self) -> str:
@@ -56,7 +57,7 @@ class Served:
 
 
 class Serving:
-    """The model that serves. All methods are called on the event loop; the work runs in one thread, in order.
+    """The model that serves. All methods are called on the event loop; one thread asks the workers, in order.
 
     Args:
         metrics: to be told about the model.
@@ -66,7 +67,9 @@ class Serving:
         self.current: Served | None = None
         self.waits_for = "no bundle was loaded yet"
         self._metrics = metrics
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="estimator")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="jobs")
+        metrics.ready.set_function(lambda: float(self.available))
+        metrics.worker_memory.set_function(self._worker_memory)
 
     def model(self, name: str | None = None, version: str | None = None) -> Served:
         """The model that serves, when it is the one asked for.
@@ -88,8 +91,24 @@ class Serving:
             )
         return served
 
+    @property
+    def available(self) -> bool:
+        """Whether a request would be worked on: a model serves, and one of its workers is loaded and not stuck."""
+        return self.current is not None and self.current.workers.available
+
+    def ready(self, name: str | None = None, version: str | None = None) -> Served:
+        """The model that serves, when it is the one asked for and a worker can answer at once.
+
+        Raises:
+            Refusal: 503 when there is none, or no worker; 404 when another name or version serves.
+        """
+        served = self.model(name, version)
+        if not served.workers.available:
+            raise Refusal(503, "no worker is ready: a lost one is being replaced", "unavailable", {"Retry-After": "2"})
+        return served
+
     def submit(self, work: Any, *arguments: Any) -> Future[Any]:
-        """Queue work for the estimator's thread."""
+        """Queue work for the thread that asks the workers."""
         return self._thread.submit(work, *arguments)
 
     def swap(self, served: Served) -> None:
@@ -99,7 +118,6 @@ class Serving:
             served.name, served.version, served.digest, kept=served.kept, last_known_good=served.last_known_good
         )
         self._metrics.registered(served.origin)
-        self._metrics.ready.set(1)
         say(
             "model", f"{served.name} {served.version} serves",
             part=served.name, version=served.version, digest=served.digest,
@@ -107,10 +125,15 @@ class Serving:
             registry=str(served.origin) if served.origin else None,
             level=logging.WARNING if served.last_known_good or not served.kept else logging.INFO,
         )  # fmt: skip
-        if old is not None and old.estimator is not served.estimator:
+        if old is not None and old.workers is not served.workers:
             # One thread, first in first out: whatever was queued for the old one comes before this.
-            self._thread.submit(old.estimator.close)
+            self._thread.submit(old.workers.close)
 
     def close(self) -> None:
-        """Take no more work; what is queued is dropped, what runs ends by its deadline."""
+        """Take no more work; what is queued or runs is dropped."""
         self._thread.shutdown(wait=False, cancel_futures=True)
+        if self.current is not None:
+            self.current.workers.close()
+
+    def _worker_memory(self) -> float:
+        return 0.0 if self.current is None else float(self.current.workers.memory_bytes)

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.inference.errors import InputError
+from attentionvote.inference.errors import InputError, nearest
 from attentionvote.inference.server.bounded_json import parse_json
-from attentionvote.inference.server.refusal import nearest
 
 INPUT = "points"
+LENGTH_HEADER = "Inference-Header-Content-Length"
 OUTPUTS = {"camera_from_part": "FP64", "confidence": "FP32", "heat": "FP32"}
 _MOST_ID = 256
 _SHORT = reprlib.Repr()

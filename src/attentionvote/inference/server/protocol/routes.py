@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from typing import Any
 
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from attentionvote.inference.runtime import runtime_version
-from attentionvote.inference.server.admission import Deadline, read_body
-from attentionvote.inference.server.answering import Answering, Question, Reply
+from attentionvote.inference.server.admission import read_body
+from attentionvote.inference.server.answering import Answering
 from attentionvote.inference.server.bounded_json import parse_json
+from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.model.reloading import Watch
 from attentionvote.inference.server.model.serving import Served
-from attentionvote.inference.server.protocol.answer import (
-    EXTENSIONS,
-    answer_parameters,
-    encode_answer,
-    model_metadata,
-    pose_tensors,
-)
-from attentionvote.inference.server.protocol.request import InferRequest, parse_request
+from attentionvote.inference.server.protocol.answer import EXTENSIONS, model_metadata
+from attentionvote.inference.server.protocol.request import LENGTH_HEADER
 from attentionvote.inference.server.refusal import Refusal
 
-LENGTH_HEADER = "Inference-Header-Content-Length"
 _MOST_INDEX_BYTES, _INDEX_S = 4096, 5.0
 
 
@@ -57,13 +50,13 @@ class ProtocolRoutes:
 
     async def _server(self, _: Request) -> Response:
         content = {"name": "attentionvote", "version": self._version, "extensions": list(EXTENSIONS)}
-        return JSONResponse(content | {"runtime": f"onnxruntime {runtime_version()}"})
+        return JSONResponse(content | {"runtime": f"onnxruntime {importlib.metadata.version('onnxruntime')}"})
 
     async def _live(self, _: Request) -> Response:
         return JSONResponse({"live": True})
 
     async def _ready(self, _: Request) -> Response:
-        served = self._serving.model()
+        served = self._serving.ready()
         content = {"ready": True, "model": served.name, "version": served.version}
         return JSONResponse(content | registered(served))
 
@@ -72,27 +65,17 @@ class ProtocolRoutes:
         return JSONResponse(model_metadata(served.name, served.version))
 
     async def _model_ready(self, request: Request) -> Response:
-        served = self._serving.model(**request.path_params)
+        served = self._serving.ready(**request.path_params)
         return JSONResponse({"name": served.name, "ready": True})
 
     async def _infer(self, request: Request) -> Response:
-        length = request.headers.get(LENGTH_HEADER)
-
-        def read(body: bytes) -> Question:
-            asked = parse_request(body, length)
-            return Question({"points": asked.points}, asked.deadline_ms, asked)
-
-        reply = await self._answering.ask(request, read, **request.path_params)
-        body, head = await run_in_threadpool(_encoded, reply)
-        headers = {} if head is None else {LENGTH_HEADER: str(head)}
-        return Response(
-            body, media_type="application/json" if head is None else "application/octet-stream", headers=headers
-        )
+        job = {"kind": "infer", "header_length": request.headers.get(LENGTH_HEADER)}
+        return await self._answering.ask(request, job, **request.path_params)
 
     async def _index(self, request: Request) -> Response:
-        body = await read_body(request, _MOST_INDEX_BYTES, Deadline(_INDEX_S))
-        if body:
-            parse_json("the request", body)  # `ready` may be asked for: all there is, is ready
+        with await read_body(request, _MOST_INDEX_BYTES, Deadline(_INDEX_S)) as body:
+            if body.size:
+                parse_json("the request", body.content())  # `ready` may be asked for: all there is, is ready
         served = self._serving.current
         models: list[dict[str, Any]] = []
         if served is not None:
@@ -116,11 +99,3 @@ def registered(served: Served) -> dict[str, Any]:
     if served.origin is None:
         return {}
     return {"registry": {"name": served.origin.name, "version": served.origin.version}}
-
-
-def _encoded(reply: Reply) -> tuple[bytes, int | None]:
-    answer, served = reply.answer.to_dict(), reply.served
-    asked: InferRequest = reply.question.request
-    parameters = answer_parameters(answer, served.name, served.digest)
-    tensors = pose_tensors(answer["poses"])
-    return encode_answer(served.name, served.version, asked.id, parameters, tensors, asked.outputs)

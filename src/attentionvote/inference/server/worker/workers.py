@@ -1,0 +1,179 @@
+"""The workers of one model: one that answers and a spare that stands loaded, for the moment the first one is lost."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from attentionvote.contract import ModelCard
+from attentionvote.inference.bundles.bundle import Bundle
+from attentionvote.inference.errors import BundleError
+from attentionvote.inference.server.deadline import Deadline
+from attentionvote.inference.server.json_logs import say
+from attentionvote.inference.server.worker.channel import Message, SharedContent
+from attentionvote.inference.server.worker.process import Loss, WorkerEnded, WorkerLost, WorkerProcess, WorkerSettings
+
+_TRIES = 5
+_LOOK_S, _FIRST_RETRY_S, _LAST_RETRY_S = 0.5, 1.0, 60.0
+
+
+class Workers:
+    """Two processes with one verified and self-tested bundle.
+
+    Args:
+        bundle: verified.
+        settings: of every worker.
+        polite: whether loading gives way to requests: another model serves meanwhile.
+        lost: told the reason whenever a worker was lost.
+
+    Attributes:
+        card: the model's.
+        digest: of the bundle.
+
+    Raises:
+        BundleError: when the bundle cannot be loaded, or fails its self-test.
+        OSError: when there is no process or memory to be had.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        settings: WorkerSettings,
+        *,
+        polite: bool = False,
+        lost: Callable[[Loss], None] = lambda _: None,
+    ) -> None:
+        self.card: ModelCard = bundle.card
+        self.digest: str = bundle.digest
+        self._bundle, self._settings, self._tell = bundle, settings, lost
+        self._changed = threading.Condition()
+        self._closed = False
+        self._active: WorkerProcess | None = WorkerProcess(bundle, settings, self_test=True, polite=polite)
+        self._spare: WorkerProcess | None = None
+        threading.Thread(target=self._keep_a_spare, name="spare worker", daemon=True).start()
+
+    @property
+    def available(self) -> bool:
+        """Whether a request would be worked on: a loaded worker is there that is not beyond a deadline."""
+        with self._changed:
+            if self._closed:
+                return False
+            return any(one is not None and one.alive and not one.overdue for one in (self._active, self._spare))
+
+    @property
+    def memory_bytes(self) -> int:
+        """Resident memory of both."""
+        with self._changed:
+            return sum(one.memory_bytes for one in (self._active, self._spare) if one is not None)
+
+    def ask(
+        self,
+        job: dict[str, Any],
+        content: SharedContent,
+        deadline: Deadline,
+        renamed: Callable[[float], None] = lambda _: None,
+    ) -> Message | None:
+        """Let a worker do a job; None when the deadline passed before there was one. One call at a time.
+
+        Raises:
+            WorkerLost: the job was lost with its worker; the next one gets another.
+            RuntimeError: when they are closed.
+        """
+        for _ in range(_TRIES):
+            worker = self._loaded(deadline)
+            if worker is None:
+                break
+            try:
+                answer = worker.ask(job, content, deadline, renamed)
+            except WorkerEnded:  # while nobody asked: this job goes to the next one
+                self._drop(worker, "crashed", "a worker ended while it had nothing to do")
+                continue
+            except WorkerLost as loss:
+                self._drop(worker, loss.reason, loss.detail)
+                raise
+            if answer.head.get("status") == 422:
+                self._drop(worker, "memory", "a job needed more memory than --job-memory-mb allows")
+            return answer
+        return None
+
+    def close(self) -> None:
+        """End both; a job that runs is lost."""
+        with self._changed:
+            self._closed = True
+            workers = [one for one in (self._active, self._spare) if one is not None]
+            self._active = self._spare = None
+            self._changed.notify_all()
+        for worker in workers:
+            worker.kill()
+
+    def _loaded(self, deadline: Deadline) -> WorkerProcess | None:
+        """The worker that answers; while there is none, the spare's loading is waited for until the deadline."""
+        with self._changed:
+            while not self._closed:
+                if self._active is None:
+                    self._active, self._spare = self._spare, None
+                    self._changed.notify_all()
+                if self._active is not None:
+                    return self._active
+                left = deadline.remaining_s()
+                if left <= 0:
+                    return None
+                self._changed.wait(left)
+        raise RuntimeError("the workers are closed: a request came after the server's end")
+
+    def _drop(self, worker: WorkerProcess, reason: Loss, detail: str) -> None:
+        """A worker is lost: the spare takes its place at once, and another spare is started."""
+        worker.kill()
+        with self._changed:
+            if self._closed:
+                return
+            if self._active is worker:
+                self._active, self._spare = self._spare, None
+            elif self._spare is worker:
+                self._spare = None
+            else:  # seen by two threads
+                return
+            stands = self._active is not None
+            self._changed.notify_all()
+        self._tell(reason)
+        say("worker", f"{detail}; {'its spare' if stands else 'the next one'} goes on", logging.ERROR, reason=reason)
+
+    def _keep_a_spare(self) -> None:
+        """Start a spare whenever there is none, and notice workers that end while nobody asks them."""
+        retry_s = _FIRST_RETRY_S
+        while True:
+            with self._changed:
+                if not self._closed and self._spare is not None:
+                    self._changed.wait(_LOOK_S)
+                if self._closed:
+                    return
+                idle = [one for one in (self._active, self._spare) if one is not None and one.ended_idle]
+                missing, alone = self._spare is None, self._active is None
+            for worker in idle:
+                self._drop(worker, "crashed", "a worker ended while it had nothing to do")
+            if not missing:
+                continue
+            try:
+                spare = WorkerProcess(self._bundle, self._settings, self_test=False, polite=not alone)
+            except (BundleError, OSError) as error:
+                say("worker", f"no spare worker can be started: {error}; it is tried again", logging.ERROR)
+                self._wait(retry_s)
+                retry_s = min(2 * retry_s, _LAST_RETRY_S)
+                continue
+            retry_s = _FIRST_RETRY_S
+            with self._changed:
+                closed = self._closed
+                if not closed:
+                    self._spare = spare
+                    self._changed.notify_all()
+            if closed:
+                spare.kill()
+
+    def _wait(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        with self._changed:
+            while not self._closed and (left := until - time.monotonic()) > 0:
+                self._changed.wait(left)
