@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from attentionvote.geometry import native
 from attentionvote.inference import PoseEstimator
 from attentionvote.inference.bundles.bundle import Bundle
+from attentionvote.inference.measured_points import measured_points
 from attentionvote.inference.preparation import find_neighbors, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.model import Predictions
@@ -85,7 +86,7 @@ def cell(material: Material, size: str) -> Contest:
     card, model = material.card(size), material.graph(size)
     estimator = PoseEstimator(Bundle(material.folder, card, "0" * 64, model))
     session, cloud = Session(model, card), material.sensed(card.density)
-    prepared = prepare(cloud, card)
+    prepared = prepare(measured_points(cloud, card), card)
 
     def compare(fast: Any, others: Mapping[str, dict[str, NDArray]]) -> str:
         outputs = others[GRAPH]

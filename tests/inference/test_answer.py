@@ -115,7 +115,7 @@ DETECTION = Detection(transform(rotation_about([0, 0, 1], np.pi / 2), [0.1, 0.2,
 
 
 def test_an_estimate_is_plain_data() -> None:
-    answer = Estimate((DETECTION,), "bracket", "abc", 100, 90, {"total": 0.5}, ("a warning",))
+    answer = Estimate((DETECTION,), "bracket", "abc", 100, 95, 90, {"total": 0.5}, ("a warning",))
     said = json.loads(json.dumps(answer.to_dict(), allow_nan=False))
     pose = said.pop("poses")[0]
     assert said == {
@@ -125,6 +125,8 @@ def test_an_estimate_is_plain_data() -> None:
         "part": "bracket",
         "model": "abc",
         "points_given": 100,
+        "points_measured": 95,
+        "poses_withheld": 0,
         "points_used": 90,
         "seconds": {"total": 0.5},
         "warnings": ["a warning"],
@@ -135,8 +137,8 @@ def test_an_estimate_is_plain_data() -> None:
 
 
 def test_an_abstention_has_the_same_fields_and_no_poses() -> None:
-    estimate = Estimate((DETECTION,), "bracket", "abc", 100, 90)
-    abstention = Abstention("too_few_points", "why", "bracket", "abc", 100, 90)
+    estimate = Estimate((DETECTION,), "bracket", "abc", 100, 95, 90)
+    abstention = Abstention("too_few_points", "why", "bracket", "abc", 100, 95, 90)
     said = abstention.to_dict()
     assert set(said) == set(estimate.to_dict()) | {"reason", "message"}
     assert (said["answer"], said["reason"], said["message"], said["poses"]) == (

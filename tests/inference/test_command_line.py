@@ -69,7 +69,7 @@ def test_a_table_of_poses(command: Command, cloud_file: Path, bundle_folder: Pat
     assert (first[0], first[4:]) == ("1", ["0.7071", "0.0000", "0.0000", "0.7071", "0.950"])
     assert 790 < float(first[3]) < 810
     assert len({len(line) for line in lines[1:4]}) == 1
-    assert lines[4].startswith("3000 of 3000 points, ")
+    assert lines[4].startswith("3000 of 3000 measured points, ")
     assert len(lines) == 5
 
 

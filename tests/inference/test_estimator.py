@@ -29,6 +29,8 @@ MakeBundle = Callable[..., Path]
 MakeCloud = Callable[..., NDArray[np.float32]]
 CROP = Crop(transform(rotation_about([1, 0, 0], np.pi), [0, 0, 0.85]), np.array([0.3, 0.3, 0.1]))
 
+LEFT_OUT = "1 poses above the thresholds lie outside the scan or are none, and were left out"
+
 
 @pytest.fixture
 def estimator(bundle_folder: Path, trusted_key: Path) -> PoseEstimator:
@@ -195,7 +197,52 @@ def test_poses_that_are_none_are_left_out_and_said(
         answer = estimator.estimate(make_cloud())
     assert isinstance(answer, Estimate)
     assert [round(d.confidence, 3) for d in answer.detections] == [0.95]
-    assert answer.warnings == ("1 proposals above the thresholds had no finite pose and were left out",)
+    assert answer.warnings == (LEFT_OUT,)
+    assert answer.poses_withheld == 1
+
+
+def test_a_pose_outside_the_scan_is_left_out_and_counted(
+    make_bundle: MakeBundle, trusted_key: Path, make_cloud: MakeCloud
+) -> None:
+    far = ((0.0, 0.0, 0.0), (1e29, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    with PoseEstimator(make_bundle(graph={"offsets": far}), trusted=trusted_key) as estimator:
+        answer = estimator.estimate(make_cloud())
+    assert isinstance(answer, Estimate)
+    assert [round(d.confidence, 3) for d in answer.detections] == [0.7]
+    assert answer.warnings == (LEFT_OUT,)
+    assert answer.to_dict()["poses_withheld"] == 1
+
+
+@pytest.mark.parametrize("far", [10.5, 1e8, 1e30, 3.4e38])
+def test_strays_change_nothing_but_the_warning(estimator: PoseEstimator, make_cloud: MakeCloud, far: float) -> None:
+    """Points that a sensor invents, in less than one of a hundred places."""
+    cloud = make_cloud()
+    strays = np.float32([[far, far, far], [-far, far, 0.8]]).repeat(10, axis=0)
+    answer = estimator.estimate(np.concatenate([cloud, strays, np.full((80, 3), np.nan, np.float32)]))
+    assert answer.to_dict()["poses"] == estimator.estimate(cloud).to_dict()["poses"]
+    assert answer.warnings == ("20 points farther than 10 m were left out",)
+    assert (answer.points_given, answer.points_measured, answer.points_used) == (3100, 3020, 3000)
+
+
+def test_a_blind_sensor_is_no_empty_bin(bundle_folder: Path, trusted_key: Path) -> None:
+    rng = np.random.default_rng(0)
+    floor = np.c_[rng.uniform(-0.14, 0.14, 3000), rng.uniform(-0.09, 0.09, 3000), np.full(3000, 0.85)]
+    blind = np.where(rng.random((3000, 1)) < 0.05, floor, np.nan)
+    with PoseEstimator(bundle_folder, trusted=trusted_key, crop=CROP) as estimator:
+        empty, unseen = estimator.estimate(floor.astype(np.float32)), estimator.estimate(blind.astype(np.float32))
+    assert isinstance(empty, Abstention)
+    assert isinstance(unseen, Abstention)
+    assert (empty.reason, unseen.reason) == ("too_few_points", "blind_sensor")
+    assert (unseen.points_given, unseen.points_measured) == (3000, np.isfinite(blind[:, 0]).sum())
+    assert "is the sensor covered" in unseen.message
+
+
+def test_a_scan_that_is_mostly_missing_is_answered_with_a_warning(
+    estimator: PoseEstimator, make_cloud: MakeCloud
+) -> None:
+    cloud = make_cloud(3000)
+    answer = estimator.estimate(np.concatenate([cloud, np.full((57_000, 3), np.nan, np.float32)]))
+    assert answer.warnings == ("only 3000 of 60000 places have a measurement",)
 
 
 def test_a_closed_estimator_says_so(estimator: PoseEstimator, make_cloud: MakeCloud) -> None:

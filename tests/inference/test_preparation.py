@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,19 +16,25 @@ from attentionvote.geometry import native
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.geometry.sampling import farthest_point_order
+from attentionvote.inference import preparation
 from attentionvote.inference.errors import InputError
+from attentionvote.inference.measured_points import measured_points
 from attentionvote.inference.preparation import (
     Crop,
+    Prepared,
     TooFewPoints,
-    checked_cloud,
     fewest_points,
     find_neighbors,
-    prepare,
 )
 from attentionvote.inference.scans.depth_files import CameraIntrinsics, read_depth
 
 MakeCard = Callable[..., ModelCard]
 MakeCloud = Callable[..., NDArray[np.float32]]
+
+
+def prepare(points: NDArray, card: ModelCard, *arguments: Any, **named: Any) -> Prepared:
+    """The inputs of a cloud's measured points."""
+    return preparation.prepare(measured_points(points, card), card, *arguments, **named)
 
 
 def overhead(height: float = 0.85, size: tuple[float, float, float] = (0.3, 0.2, 0.1), margin: float = 0.002) -> Crop:
@@ -65,7 +72,7 @@ def test_inputs_are_points_of_the_cloud_with_the_dense_clouds_normals(
     assert len(rows(prepared.points)) == 256
     assert rows(prepared.points) <= rows(cloud)
     np.testing.assert_allclose(prepared.normals[0], estimate_normals(cloud, prepared.points[0], 30), atol=1e-5)
-    assert (prepared.given, prepared.used, prepared.warnings) == (3000, 3000, ())
+    assert (prepared.used, prepared.warnings) == (3000, ())
 
 
 def test_more_points_than_the_density_are_thinned_before_the_normals(
@@ -111,7 +118,6 @@ def test_the_camera_may_see_more_than_the_bin(make_card: MakeCard, make_cloud: M
     kept = inside[crop.inside(inside)]
     prepared = prepare(np.concatenate([hall, floor, inside]), make_card(), crop)
     assert prepared.used == len(kept)
-    assert prepared.given == 14_000
     assert rows(prepared.points) <= rows(kept)
 
 
@@ -200,44 +206,6 @@ def test_millimetres_are_refused_also_when_the_crop_would_leave_nothing(
     for crop in (None, overhead()):
         with pytest.raises(InputError, match="were millimetres sent"):
             prepare(make_cloud() * np.float32(1000), make_card(), crop)
-
-
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        ([[0, 0, 1]], r"must be an array \(P, 3\), or organised \(H, W, 3\), got list"),
-        (np.zeros(3, np.float32), r"got \(3,\)"),
-        (np.zeros((5, 4), np.float32), r"got \(5, 4\)"),
-        (np.zeros((5, 5, 5, 3), np.float32), r"got \(5, 5, 5, 3\)"),
-        (np.float32(1), r"got float32"),
-        (np.zeros((5, 3), np.int32), "must be floating-point metres, got int32"),
-        (np.zeros((5, 3), complex), "must be floating-point metres, got complex128"),
-        (np.zeros((5, 3), object), "must be floating-point metres, got object"),
-        (np.float32([[0, 0, np.nan], [0, 0, 1]]), "must be finite, got 1 of 2 with NaN or inf: drop them, or send"),
-        (np.float32([[0, 0, np.inf], [0, -np.inf, 1]]), "must be finite, got 2 of 2"),
-        (np.array([[0, 0, 1e300]]), "must be finite, got 1 of 1"),
-        (np.float32([[[0, 0, np.inf], [0, 0, 1]]]), "got 1 of 2 .*: in an organised cloud a missing point is NaN"),
-        (np.broadcast_to(np.float32(1), (4_000_001, 3)), "must be at most 4000000, got 4000001: crop or thin"),
-    ],
-)
-def test_an_array_that_is_no_cloud_is_one_sentence(make_card: MakeCard, points: NDArray, message: str) -> None:
-    with pytest.raises(InputError, match=f"^points .*{message}"):
-        prepare(points, make_card())
-
-
-def test_missing_points_of_an_organised_cloud_are_left_out() -> None:
-    image = np.full((4, 5, 3), np.nan)
-    image[1, 2], image[3, 4] = (0.1, 0.2, 0.8), (0.3, 0.4, 0.9)
-    image[0, 0, 0] = 1.0  # one coordinate is not a point
-    cloud, given = checked_cloud(image)
-    np.testing.assert_array_equal(cloud, np.float32([[0.1, 0.2, 0.8], [0.3, 0.4, 0.9]]))
-    assert given == 20
-
-
-def test_the_origin_is_how_some_sensors_write_missing() -> None:
-    cloud, given = checked_cloud(np.float32([[0, 0, 0], [0, 0, 0.8], [-0.0, 0, 0]]))
-    np.testing.assert_array_equal(cloud, np.float32([[0, 0, 0.8]]))
-    assert given == 3
 
 
 def test_the_callers_array_is_not_changed(make_card: MakeCard, make_cloud: MakeCloud) -> None:

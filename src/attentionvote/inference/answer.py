@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from attentionvote.contract import FRAME, UNITS, ModelCard, is_detection
 from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix, transform
 
-Reason = Literal["too_few_points", "nothing_found", "deadline_exceeded"]
+# Why there is no pose, the whole list: too_few_points (an empty bin), nothing_found (nothing above the thresholds),
+# deadline_exceeded, blind_sensor (too little of the bin was measured), bin_not_found (the bin is elsewhere), wrong_part
+# (what lies there is another part), no_pick (there are poses, but none that the robot can take).
+Reason = Literal[
+    "too_few_points", "nothing_found", "deadline_exceeded", "blind_sensor", "bin_not_found", "wrong_part", "no_pick"
+]
+REASONS: tuple[Reason, ...] = get_args(Reason)
 DIGEST_LENGTH = 12
 
 
@@ -51,19 +57,23 @@ class Estimate:
         detections: most confident first, at least one.
         part: what was looked for.
         model: the first digits of the bundle's digest.
-        points_given: points sent, missing ones included.
+        points_given: places of the cloud or pixels of the image, missing measurements included.
+        points_measured: those with a measurement.
         points_used: points left after the crop.
         seconds: by stage, and their ``total``.
         warnings: sentences about an unusual cloud.
+        poses_withheld: how many poses were left out because they could not be where the scan was measured.
     """
 
     detections: tuple[Detection, ...]
     part: str
     model: str
     points_given: int
+    points_measured: int
     points_used: int
     seconds: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    poses_withheld: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON, with the list ``poses``."""
@@ -75,10 +85,9 @@ class Abstention:
     """No pose is answered, and why.
 
     Attributes:
-        reason: ``too_few_points`` (an empty bin), ``nothing_found`` (nothing above the thresholds) or
-            ``deadline_exceeded``.
+        reason: one of ``REASONS``.
         message: the reason in a sentence.
-        part, model, points_given, points_used, seconds, warnings: as in ``Estimate``.
+        part, model, points_given, points_measured, points_used, seconds, warnings, poses_withheld: as in ``Estimate``.
     """
 
     reason: Reason
@@ -86,9 +95,11 @@ class Abstention:
     part: str
     model: str
     points_given: int
+    points_measured: int
     points_used: int
     seconds: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    poses_withheld: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON; ``poses`` is there and empty."""
@@ -103,9 +114,11 @@ def _facts(answer: Estimate | Abstention) -> dict[str, Any]:
         "part": answer.part,
         "model": answer.model,
         "points_given": answer.points_given,
+        "points_measured": answer.points_measured,
         "points_used": answer.points_used,
         "seconds": dict(answer.seconds),
         "warnings": list(answer.warnings),
+        "poses_withheld": answer.poses_withheld,
     }
 
 

@@ -172,7 +172,9 @@ def _estimate(options: argparse.Namespace) -> int:
         given: dict[str, Any] = {"depth": read_depth(content, name), "camera": cell.camera}
     else:
         given = {"points": read_cloud(content, name)}
-    with PoseEstimator(options.bundle, threads=options.threads, crop=cell.crop, trusted=_trusted(options)) as estimator:
+    with PoseEstimator(
+        options.bundle, threads=options.threads, crop=cell.crop, camera=cell.camera, trusted=_trusted(options)
+    ) as estimator:
         answer = estimator.estimate(**given, deadline_s=deadline_s)
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
@@ -189,7 +191,9 @@ def table(answer: Estimate | Abstention) -> str:
     from attentionvote.inference.answer import Abstention
 
     total = answer.seconds.get("total", math.nan)
-    facts = f"{answer.points_used} of {answer.points_given} points, {1000 * total:.0f} ms, model {answer.model}"
+    facts = (
+        f"{answer.points_used} of {answer.points_measured} measured points, {1000 * total:.0f} ms, model {answer.model}"
+    )
     if isinstance(answer, Abstention):
         return f"{answer.part}: no pose, {answer.reason}: {answer.message}\n{facts}"
     rows = [["", "x mm", "y mm", "z mm", "qw", "qx", "qy", "qz", "confidence"]]

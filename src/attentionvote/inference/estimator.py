@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import EllipsisType, TracebackType
 from typing import Any
@@ -11,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
-from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection, Estimate, detections_from
+from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection, Estimate, Reason, detections_from
+from attentionvote.inference.blind_sensor import LEAST_SHARE, BlindSensor
 from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder
 from attentionvote.inference.errors import DeadlineExceeded, InputError
-from attentionvote.inference.preparation import Crop, Prepared, TooFewPoints, find_neighbors, prepare
+from attentionvote.inference.measured_points import MOST_POINTS, measured_points
+from attentionvote.inference.pose_check import plausible
+from attentionvote.inference.preparation import Crop, TooFewPoints, find_neighbors, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.inference.scans.depth_files import CameraIntrinsics
 
@@ -31,6 +37,8 @@ class PoseEstimator:
         bundle: a loaded bundle, or the folder of one.
         threads: of one run of the graph.
         crop: the inside of the bin; None: the clouds hold parts only.
+        camera: of the cell: how much of the bin a cloud should show. A depth image brings its own.
+        most_points: that a cloud may have measured.
         trusted: whose signature a folder's bundle must have: a public key, its file, or None for anybody's; left out:
             ``signing.pub`` in ``keys_folder()``. A loaded bundle has been checked already.
 
@@ -45,6 +53,8 @@ class PoseEstimator:
         *,
         threads: int = 1,
         crop: Crop | None = None,
+        camera: CameraIntrinsics | None = None,
+        most_points: int = MOST_POINTS,
         trusted: Trusted | EllipsisType = ...,
     ) -> None:
         if not isinstance(bundle, Bundle):
@@ -53,6 +63,7 @@ class PoseEstimator:
         self.card: ModelCard = bundle.card
         self.digest: str = bundle.digest
         self.crop = crop
+        self._camera, self._most_points = camera, most_points
         self._session: Session | None = Session(bundle.model, bundle.card, threads)
 
     def estimate(
@@ -85,6 +96,12 @@ class PoseEstimator:
         """
         return self._estimate(points, None, None, None, None)
 
+    def _measured_by(self, depth: NDArray[Any] | None, camera: CameraIntrinsics | None) -> CameraIntrinsics | None:
+        """The camera of a scan, with the size of its images where it is known."""
+        if depth is None or camera is None:
+            return self._camera
+        return replace(camera, width=depth.shape[1], height=depth.shape[0])
+
     def close(self) -> None:
         """Let the session go; runs that have begun still end."""
         self._session = None
@@ -113,32 +130,37 @@ class PoseEstimator:
             "part": self.card.part.name,
             "model": self.digest[:DIGEST_LENGTH],
             "points_given": 0,
+            "points_measured": 0,
             "points_used": 0,
         }
         try:
             cloud = _cloud(points, depth, camera)
-            if isinstance(cloud, np.ndarray):  # preparation refuses anything else
-                facts["points_given"] = depth.size if depth is not None else cloud.size // 3
-            clock.lap("read")
-            prepared = _prepared(cloud, self.card, crop, clock, depth is not None)
-            facts |= {"points_used": prepared.used, "warnings": prepared.warnings}
+            with _naming_the_camera(depth is not None):
+                scan = measured_points(cloud, self.card, self._most_points)
+                facts["points_given"] = scan.given if depth is None else depth.size
+                facts["points_measured"] = scan.measured
+                clock.lap("read")
+                prepared = prepare(scan, self.card, crop, self._measured_by(depth, camera), between=clock.check)
+            facts |= {"points_used": prepared.used, "warnings": (*prepared.warnings, *_sparse(facts, crop))}
             clock.lap("prepare")
             neighbors = find_neighbors(prepared.points, session.layout)
             outputs = session.run(prepared.points, prepared.normals, clock.left(), neighbors)
             clock.lap("graph")
-        except TooFewPoints as error:
+        except (TooFewPoints, BlindSensor) as error:
             facts |= {"points_used": error.used, "seconds": clock.seconds()}
-            return Abstention(**facts, reason="too_few_points", message=str(error))
+            reason: Reason = "blind_sensor" if isinstance(error, BlindSensor) else "too_few_points"
+            return Abstention(**facts, reason=reason, message=str(error))
         except DeadlineExceeded:
             message = f"the deadline of {deadline_s:g} s passed before there was an answer"
             return Abstention(**facts, seconds=clock.seconds(), reason="deadline_exceeded", message=message)
-        found, unsound = detections_from(outputs, self.card)
-        if unsound:
-            sentence = f"{unsound} proposals above the thresholds had no finite pose and were left out"
-            facts["warnings"] = (*prepared.warnings, sentence)
+        detections, unsound = detections_from(outputs, self.card)
+        detections, strange = plausible(detections, prepared.points[0], self.card)
+        if withheld := unsound + strange:
+            sentence = f"{withheld} poses above the thresholds lie outside the scan or are none, and were left out"
+            facts |= {"poses_withheld": withheld, "warnings": (*facts["warnings"], sentence)}
         facts["seconds"] = clock.seconds()
-        if found:
-            return Estimate(**facts, detections=found)
+        if detections:
+            return Estimate(**facts, detections=detections)
         message = (
             f"no proposal reached the thresholds (heat {self.card.peak_threshold:g}, "
             f"confidence {self.card.confidence_threshold:g})"
@@ -177,13 +199,22 @@ class _Clock:
         return {**self._seconds, "total": time.monotonic() - self._start}
 
 
-def _prepared(cloud: NDArray[Any], card: ModelCard, crop: Crop | None, clock: _Clock, from_depth: bool) -> Prepared:
+@contextmanager
+def _naming_the_camera(from_depth: bool) -> Iterator[None]:
+    """What is wrong with the points of a depth image is its camera's fault."""
     try:
-        return prepare(cloud, card, crop, between=clock.check)
+        yield
     except InputError as error:
         if from_depth:
             raise InputError(f"{error} (a depth image: depth_scale and depth_offset of its camera decide)") from error
         raise
+
+
+def _sparse(facts: Mapping[str, Any], crop: Crop | None) -> Iterator[str]:
+    """A warning when most places have no measurement; with a bin that is looked at more closely."""
+    given, measured = facts["points_given"], facts["points_measured"]
+    if crop is None and measured < LEAST_SHARE * given:
+        yield f"only {measured} of {given} places have a measurement"
 
 
 def _cloud(

@@ -18,10 +18,12 @@ from attentionvote.geometry import native
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.geometry.pose import apply, inverse
 from attentionvote.geometry.sampling import level_neighbors
+from attentionvote.inference.blind_sensor import check_sight
 from attentionvote.inference.errors import InputError
+from attentionvote.inference.measured_points import MeasuredPoints
 from attentionvote.inference.scale_check import check_scene, check_unit
+from attentionvote.inference.scans.depth_files import CameraIntrinsics
 
-MOST_POINTS = 4_000_000
 SEED = 0
 _FARTHEST = 20
 
@@ -103,14 +105,12 @@ class Prepared(NamedTuple):
 
     Attributes:
         points, normals: ``(1, N, 3)`` float32, camera frame.
-        given: points sent.
         used: points left without missing ones and after the crop.
         warnings: sentences about an unusual cloud.
     """
 
     points: NDArray[np.float32]
     normals: NDArray[np.float32]
-    given: int
     used: int
     warnings: tuple[str, ...]
 
@@ -134,72 +134,43 @@ def fewest_points(card: ModelCard) -> int:
 
 
 def prepare(
-    points: NDArray[Any],
+    scan: MeasuredPoints,
     card: ModelCard,
     crop: Crop | None = None,
+    camera: CameraIntrinsics | None = None,
     seed: int = SEED,
     between: Callable[[], None] = lambda: None,
 ) -> Prepared:
     """The graph's inputs from a cloud.
 
     Args:
-        points: ``(P, 3)``, or an organised cloud ``(H, W, 3)`` in which NaN is missing; metres, camera frame.
-            A point exactly at the origin is missing too: that is how sensors without NaN write it.
+        scan: its measured points.
         card: of the model.
         crop: the inside of the bin; None: the cloud holds parts only.
+        camera: that measured it, where it is known: how much of the bin it should have measured.
         seed: of the random choices.
         between: called before each step that takes long; what it raises ends the preparation.
 
     Raises:
-        InputError: when the array is no cloud, or is not in metres in the camera frame.
+        InputError: when the cloud is not in metres in the camera frame.
+        BlindSensor: when much less of the bin was measured than is to be expected.
         TooFewPoints: when fewer points are left than normals need.
     """
-    cloud, given = checked_cloud(points)
-    seen, least = len(cloud), fewest_points(card)
+    cloud, seen, least = scan.points, len(scan.points), fewest_points(card)
     if crop is not None or seen < least:  # otherwise check_scene says the same, and more
         check_unit(cloud, card)
     if crop is not None:
         between()
-        cloud = cloud[crop.inside(cloud)]
+        inside = crop.inside(cloud)
+        check_sight(cloud, int(np.count_nonzero(inside)), (crop.camera_from_bin, crop.size), card, camera)
+        cloud = cloud[inside]
     if len(cloud) < least:
         where = f" are left in the bin of {seen} measured" if crop is not None else " were measured"
         raise TooFewPoints(f"{len(cloud)} points{where}, at least {least} are needed to look for parts", len(cloud))
-    warnings = check_scene(cloud, card)
+    warnings = (*scan.warnings, *check_scene(cloud, card))
     rng = np.random.default_rng(seed)
     dense = cloud if len(cloud) <= card.density else cloud[sample_indices(len(cloud), card.density, rng)]
     chosen = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])
     between()
     normals = estimate_normals(dense, chosen, card.normal_neighbors, make=False)
-    return Prepared(chosen[None], normals[None], given, len(cloud), warnings)
-
-
-def checked_cloud(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
-    """The measured points ``(P, 3)`` float32 of a cloud and how many places it had.
-
-    Raises:
-        InputError: on another shape or type, too many points, or values that are not finite.
-    """
-    if not isinstance(points, np.ndarray) or points.ndim not in (2, 3) or points.shape[-1] != 3:
-        shape = points.shape if isinstance(points, np.ndarray) else type(points).__name__
-        raise InputError(f"points must be an array (P, 3), or organised (H, W, 3), got {shape}")
-    if points.dtype.kind != "f":
-        raise InputError(
-            f"points must be floating-point metres, got {points.dtype}: divide counts by their scale first"
-        )
-    given = points.size // 3
-    if given > MOST_POINTS:
-        raise InputError(f"points must be at most {MOST_POINTS}, got {given}: crop or thin the cloud out")
-    flat = points.reshape(-1, 3)
-    if points.ndim == 3:
-        flat = flat[~np.isnan(flat).any(axis=1)]
-    with np.errstate(over="ignore"):
-        cloud = flat.astype(np.float32)
-    if not np.isfinite(cloud).all():
-        finite = np.isfinite(cloud).all(axis=1)
-        remedy = "drop them, or send the organised cloud (H, W, 3) in which NaN is missing"
-        if points.ndim == 3:
-            remedy = "in an organised cloud a missing point is NaN"
-        raise InputError(f"points must be finite, got {int((~finite).sum())} of {given} with NaN or inf: {remedy}")
-    if not cloud[:, 2].all():  # a missing point is at the camera; few sensors send any
-        cloud = cloud[cloud.any(axis=1)]
-    return np.ascontiguousarray(cloud), given
+    return Prepared(chosen[None], normals[None], len(cloud), warnings)

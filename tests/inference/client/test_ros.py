@@ -26,7 +26,9 @@ BOX = ((-0.05, -0.02, -0.01), (0.07, 0.02, 0.03))
 
 def answer(pose: np.ndarray, confidence: float = 0.75) -> dict[str, Any]:
     found = Detection(pose, confidence, "gear", 4.0)
-    return Estimate(detections=(found,), part="gear", model="12ab", points_given=9, points_used=9).to_dict()
+    return Estimate(
+        detections=(found,), part="gear", model="12ab", points_given=9, points_measured=9, points_used=9
+    ).to_dict()
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -83,7 +85,9 @@ def test_a_quarter_turn_about_z_by_hand() -> None:
 
 
 def test_an_abstention_has_no_detections() -> None:
-    empty = Abstention("too_few_points", "0 points", part="gear", model="12ab", points_given=0, points_used=0)
+    empty = Abstention(
+        "too_few_points", "0 points", part="gear", model="12ab", points_given=0, points_measured=0, points_used=0
+    )
     content = detection_array(empty.to_dict(), BOX, "camera", 7)
     assert content["detections"] == []
     assert content["header"]["stamp"] == {"sec": 7, "nanosec": 0}

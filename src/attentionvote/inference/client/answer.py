@@ -49,7 +49,7 @@ class Answer:
         camera_from_part: ``(n, 4, 4)`` float64, metres, most confident first.
         confidence: ``(n,)`` float32.
         heat: ``(n,)`` float32, how many votes agree on each.
-        status: ``ok``, ``too_few_points`` (an empty bin) or ``nothing_found``.
+        status: ``ok``, or the reason why there is none: one of ``inference.answer.REASONS``.
         message: the status in a sentence; empty when ok.
         warnings: about an unusual cloud; empty without.
         part: what was looked for.

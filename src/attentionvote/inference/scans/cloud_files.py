@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.inference.errors import InputError
-from attentionvote.inference.preparation import MOST_POINTS
+from attentionvote.inference.measured_points import MOST_POINTS
 from attentionvote.inference.scans import pcd_file, ply_file
 from attentionvote.inference.scans.array_bytes import NPY_MAGIC, NPZ_MAGIC, array_from_npy, arrays_from_npz
 from attentionvote.inference.scans.depth_files import PNG_MAGIC

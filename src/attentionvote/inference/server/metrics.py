@@ -10,6 +10,7 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from attentionvote.inference.answer import REASONS
 from attentionvote.inference.fetching.reference import RegistryVersion
 
 OUTCOMES = ("ok", "abstained", "rejected", "unauthorized", "overloaded", "unavailable", "deadline", "gone", "failed")
@@ -19,7 +20,6 @@ DETECTIONS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
 RELOADS = ("loaded", "refused", "failed", "last_known_good")
 LOSSES = ("deadline", "memory", "crashed")
 POLLS = ("answered", "away", "refused", "failed")
-ABSTENTIONS = ("too_few_points", "nothing_found", "deadline_exceeded")
 
 
 class Metrics:
@@ -99,12 +99,12 @@ class Metrics:
             self.requests.labels(outcome)
         for stage in STAGES:
             self.seconds.labels(stage)
-        for reason in ABSTENTIONS:
+        for reason in REASONS:
             self.abstentions.labels(reason)
         for outcome in POLLS:
             self.registry_polls.labels(outcome)
-        for reason in LOSSES:
-            self.workers_lost.labels(reason)
+        for loss in LOSSES:
+            self.workers_lost.labels(loss)
         for outcome in RELOADS:
             self.reloads.labels(outcome)
 

@@ -83,6 +83,7 @@ class _Job:
         answer = self._estimator.estimate(**arguments, deadline_s=left)
         self.seconds["estimate"] = time.monotonic() - parsed
         head: dict[str, Any] = {"status": 200, "outcome": "ok", "points": answer.points_given}
+        head["withheld"] = answer.poses_withheld
         if isinstance(answer, Abstention):
             head |= {"outcome": "abstained", "reason": answer.reason}
             if answer.reason == "deadline_exceeded":

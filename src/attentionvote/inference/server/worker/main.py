@@ -102,7 +102,7 @@ def _load(message: Message) -> tuple[Jobs | None, str | None]:
     bundle = Bundle(Path(), card, head["digest"], model, dict(zip(head["golden"], golden, strict=True)))
     cell = parse_cell(cell_text) if cell_text else Cell()
     try:
-        estimator = PoseEstimator(bundle, threads=head["threads"], crop=cell.crop)
+        estimator = PoseEstimator(bundle, threads=head["threads"], crop=cell.crop, camera=cell.camera)
     except BundleError as error:
         return None, str(error)
     problems = self_test(estimator, bundle) if head["self_test"] else []
