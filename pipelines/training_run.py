@@ -94,6 +94,8 @@ class TrainingRun:
         self.workers = cfg.workers or cores()
         with quiet_lightning():
             self.trainer = self._trainer()
+        # Lightning itself does so only after the average of the weights was set up and a checkpoint was loaded.
+        self.trainer.precision_plugin.convert_module(self.module)
 
     def run(self) -> dict[str, Any] | None:
         """Everything; the dictionary of the JSON line, None where the first process prints it."""

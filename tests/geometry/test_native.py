@@ -91,6 +91,11 @@ def test_a_function_without_memory_raises() -> None:
         native.call(Failing())
 
 
+@pytest.mark.parametrize(("answer", "served"), [(0, True), (2, False)])
+def test_a_function_says_whether_it_serves(answer: int, served: bool) -> None:
+    assert native.call(lambda *_: answer) is served  # type: ignore[arg-type]
+
+
 def test_disabled_leaves_the_references_and_comes_back() -> None:
     before = native.load("attentionvote.geometry", "pointops.c")
     with native.disabled():

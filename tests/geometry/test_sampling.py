@@ -77,6 +77,17 @@ def test_three_nearest_equals_its_reference(seed: int, sources: int, targets: in
     np.testing.assert_array_equal(distance, expected_distance)
 
 
+def test_squares_that_overflow_are_farthest_and_never_inside() -> None:
+    most = np.finfo(np.float32).max
+    points = np.float32([[0, 0, 0], [1, 0, 0], [-most, 0, 0], [most, 0, 0], [0, most, 0]])
+    np.testing.assert_array_equal(sampling.farthest_point_order(points, 5), [0, 2, 3, 4, 1])
+    for radius, own in ((1.0, [2, 2, 1, 1, 1]), (float(most), [2, 2, 1, 1, 1]), (0.5, [1, 1, 1, 1, 1])):
+        np.testing.assert_array_equal(sampling.ball_query(points, points, radius, 3)[1], own)
+    index, distance = sampling.three_nearest(points, points[3:])
+    np.testing.assert_array_equal(index, [[3, 0, 1], [4, 0, 1]])
+    np.testing.assert_array_equal(distance, np.sqrt([[0, most, most]] * 2, dtype=np.float32))
+
+
 POINTS = cloud(0, 5, False)
 BROKEN = np.where(np.arange(15).reshape(5, 3) == 7, np.nan, POINTS)
 

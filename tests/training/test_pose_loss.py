@@ -191,10 +191,12 @@ def test_an_unknown_kind_is_refused(make_box: Callable) -> None:
         SymmetricPose.of(make_box()).rotation_loss("euler", torch.zeros(1, 4), one, one)
 
 
-def test_moving_to_another_device_moves_everything(make_box: Callable) -> None:
-    pose = SymmetricPose.of(make_box(Symmetry("revolution", flip=True))).to(torch.device("meta"))
-    assert pose.axis is not None
-    assert {t.device.type for t in (pose.group, pose.representation, pose.axis)} == {"meta"}
+def test_everything_follows_device_and_precision_of_the_predictions(make_box: Callable) -> None:
+    pose = SymmetricPose.of(make_box(Symmetry("revolution", flip=True)))
+    for dtype in (torch.float32, torch.float64):
+        own = pose.like(torch.zeros((), device="meta", dtype=dtype))
+        assert own.axis is not None
+        assert {(t.device.type, t.dtype) for t in (own.group, own.representation, own.axis)} == {("meta", dtype)}
 
 
 def test_losses_are_computed_where_the_poses_are(symmetric_part: Part) -> None:

@@ -39,9 +39,14 @@ class Batch(NamedTuple):
     visible: Tensor
     part: Tensor
 
-    def to(self, device: torch.device | str) -> Batch:
-        """The same on another device."""
-        return Batch(**{name: getattr(self, name).to(device) for name in self._fields})
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Batch:
+        """The same on another device; real numbers in the precision of ``dtype`` where that is given."""
+
+        def moved(value: Tensor) -> Tensor:
+            return value.to(device, dtype if value.is_floating_point() else None)
+
+        found = self.found.to(device, dtype)
+        return Batch(**{name: moved(getattr(self, name)) for name in self._fields if name != "found"}, found=found)
 
     def first(self, count: int) -> Batch:
         """Only the first ``count`` samples."""

@@ -86,10 +86,17 @@ def _library(package: str, file: str, tuned: bool) -> tuple[Path, tuple[str, ...
     return cache_folder() / f"{Path(file).stem}-{key[:16]}.so", flags, source
 
 
-def call(function: ctypes._NamedFuncPointer, *arguments: object) -> None:
-    """Call a C function that returns 0 for success and 1 for no memory; arrays and None go as pointers.
+def call(function: ctypes._NamedFuncPointer, *arguments: object) -> bool:
+    """Call a C function that returns 0 for success, 1 for no memory and 2 where it cannot serve its arguments.
 
-    The interpreter's lock is released during the call, so several threads may work at once.
+    Arrays and None go as pointers. The interpreter's lock is released during the call, so several threads may work at
+    once.
+
+    Returns:
+        whether it served; where it did not, its results mean nothing, and the slow reference answers.
+
+    Raises:
+        MemoryError: when there is no memory.
     """
     converted: list[object] = []
     for argument in arguments:
@@ -101,8 +108,10 @@ def call(function: ctypes._NamedFuncPointer, *arguments: object) -> None:
             converted.append(ctypes.c_float(argument))
         else:
             converted.append(argument)
-    if function(*converted):
+    answer = function(*converted)
+    if answer == 1:
         raise MemoryError(f"{function.__name__} ran out of memory")
+    return bool(answer == 0)
 
 
 def long(value: int) -> ctypes.c_int64:

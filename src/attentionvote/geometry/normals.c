@@ -4,7 +4,8 @@
  * with. The cloud comes sorted along a curve (morton_order in pointops.c): leaves of a few points with boxes, twigs of
  * a few leaves with boxes. Queries come sorted alike: a few that lie together share the leaves around them, and the
  * last one's k-th neighbour says about how far the next has to look. Single precision decides where it can, else double
- * precision, and ties go to the lower index. Loops over LEAF or LANES are vectorised.
+ * precision, and ties go to the lower index. Loops over LEAF or LANES are vectorised. No infinity may arise, as in
+ * pointops.c: what lies beyond WIDEST is refused, and guesses stay between SMALLEST and 2 * LARGEST.
  */
 #include <float.h>
 #include <math.h>
@@ -20,16 +21,13 @@
 #define SLACK 1.00001f   /* covers rounding of squared distances in single precision */
 #define SMALLEST 1e-30f  /* smaller and larger ones have no single precision */
 #define LARGEST (FLT_MAX / 8)
+#define WIDEST 1e18f     /* metres from the origin on an axis, as in pointops.c: no square overflows */
+#define ZERO 1e-100      /* of a covariance: the square of a quotient by more than that is finite */
+#define FAR 8e18f        /* where padding lies: farther from all than 2 * LARGEST, yet its square is finite, too */
 
-typedef struct {
-    float low[3], high[3];
-} box;
 typedef double lanes[LANES];
-
-typedef struct { /* one axis after the other: all are looked at together */
-    float low[3][LEAF], high[3][LEAF];
-} boxes;
-
+typedef struct { float low[3], high[3]; } box;
+typedef struct { float low[3][LEAF], high[3][LEAF]; } boxes; /* axis after axis: all are looked at together */
 typedef struct {
     int32_t n, twigs;     /* LEAF points a leaf, LEAF leaves a twig */
     boxes *leaf, *twig;   /* of a twig's leaves, of LEAF twigs; those beyond the last point are empty */
@@ -42,10 +40,16 @@ static void widen(float *low, float *high, float v) {
     *high = v > *high ? v : *high;
 }
 
+static int narrow(const float *xyz, int32_t n) {
+    float most = 0;
+    for (int64_t i = 0; i < 3 * (int64_t)n; i++) most = fabsf(xyz[i]) > most ? fabsf(xyz[i]) : most;
+    return most <= WIDEST;
+}
+
 static void fill_boxes(tree *t) {
     for (int32_t i = 0; i < t->twigs + t->twigs / LEAF + 1; i++) /* twigs' boxes lie behind those of leaves */
         for (int a = 0; a < 3; a++)
-            for (int j = 0; j < LEAF; j++) t->leaf[i].low[a][j] = FLT_MAX, t->leaf[i].high[a][j] = -FLT_MAX;
+            for (int j = 0; j < LEAF; j++) t->leaf[i].low[a][j] = FAR, t->leaf[i].high[a][j] = -FAR;
     for (int32_t i = 0; i < t->n; i++) {
         const float p[3] = {t->x[i], t->y[i], t->z[i]};
         const int32_t leaf = i / LEAF, twig = leaf / LEAF;
@@ -77,8 +81,7 @@ typedef struct {
 } surroundings;
 
 static void collect(const tree *t, surroundings *s) {
-    float to_twig[LEAF], to_leaf[LEAF];
-    const float bound = s->reach * SLACK * SLACK;
+    float to_twig[LEAF], to_leaf[LEAF], bound = s->reach * SLACK * SLACK;
     s->count = 0;
     for (int32_t i = 0; i < t->twigs; i++) {
         if (i % LEAF == 0) between(t->twig + i / LEAF, &s->queries, to_twig);
@@ -103,11 +106,7 @@ static int join(box *queries, const float *p, float longest) {
     return diagonal <= longest;
 }
 
-typedef struct {
-    float *about; /* squared distances in single precision */
-    double *squared;
-    int32_t *place; /* in tree order */
-} candidates;
+typedef struct { float *about; double *squared; int32_t *place; } candidates; /* about: squared, in single precision */
 
 /* Of the points at n places the k nearest to p come first, sorted; of equally far ones those with the lowest index. */
 static void choose(const tree *t, const float *p, candidates *near, int32_t n, int32_t k) {
@@ -156,15 +155,16 @@ static int32_t find(const tree *t, const float *p, const surroundings *s, float 
 static int nearest(const tree *t, const float *p, int32_t k, const surroundings *s, float *guess, candidates *near) {
     float low = 0, high = *guess < s->reach ? *guess : s->reach;
     int32_t below = 0, n = find(t, p, s, high, near), inside = within(near->about, n, high);
-    for (; inside < k; n = find(t, p, s, high, near), inside = within(near->about, n, high)) {
+    for (double factor = 1.5; inside < k; factor *= factor) { /* a few steps to any magnitude */
         if (high >= s->reach) return 0;
-        low = high, below = inside;
-        high = high * 1.5f < s->reach ? high * 1.5f : s->reach;
+        low = high, below = inside, high = (float)fmin(high * factor, s->reach);
+        n = find(t, p, s, high, near), inside = within(near->about, n, high);
     }
-    for (int tries = 1; inside > k && tries <= 12; tries++) {
-        /* On a surface the number of points grows with the squared distance. */
+    for (int tries = 1; inside > k && tries <= (inside > 8 * k && high > SMALLEST ? 72 : 12); tries++) {
+        /* On a surface the number of points grows with the squared distance; else with any power of it. */
         const float share = tries % 4 ? ((float)(k - below) + 0.5f) / (float)(inside - below) : 0.5f;
-        const float middle = low + (high - low) * share;
+        const float power = sqrtf(low > SMALLEST ? low : SMALLEST) * sqrtf(high);
+        const float middle = tries > 12 ? power : low + (high - low) * share;
         const int32_t now = within(near->about, n, middle);
         if (now < k) low = middle, below = now;
         else high = middle, inside = now;
@@ -182,21 +182,21 @@ static int nearest(const tree *t, const float *p, int32_t k, const surroundings 
 /* The same where the leaves of the group, complete up to s->reach, do not suffice. */
 static void nearest_alone(const tree *t, const float *p, int32_t k, surroundings *s, float *guess, candidates *near) {
     s->queries = (box){{p[0], p[1], p[2]}, {p[0], p[1], p[2]}};
-    while (s->reach < LARGEST) {
-        s->reach = s->reach * 2;
+    for (double factor = 2; s->reach < LARGEST; factor *= factor) {
+        *guess = s->reach = (float)fmin(s->reach * factor, LARGEST);
         collect(t, s);
         if (nearest(t, p, k, s, guess, near)) return;
     }
     for (int32_t i = 0; i < t->n; i++) near->place[i] = i;
     choose(t, p, near, t->n, k);
-    *guess = near->squared[k - 1] < LARGEST ? (float)near->squared[k - 1] + SMALLEST : FLT_MAX;
+    *guess = (float)near->squared[k - 1] + SMALLEST;
 }
 
 /* One of Jacobi's rotations, of those matrices that are not diagonal yet. */
 static inline void rotate(lanes m[3][3], lanes v[3][3], const lanes busy, int p, int q, int r) {
     lanes theta, sign; /* loops of their own: GCC vectorises no branches */
     for (int l = 0; l < LANES; l++) {
-        const double done = m[p][q][l] == 0 ? 1.0 : 0.0;
+        const double done = fabs(m[p][q][l]) <= ZERO ? 1.0 : 0.0;
         theta[l] = (m[q][q][l] - m[p][p][l]) / (2 * m[p][q][l] + done);
         sign[l] = busy[l] - busy[l] * done;
     }
@@ -230,8 +230,7 @@ static void least_directions(lanes m[3][3], lanes normal[3]) {
         rotate(m, v, busy, 0, 1, 2), rotate(m, v, busy, 0, 2, 1), rotate(m, v, busy, 1, 2, 0);
     }
     for (int l = 0; l < LANES; l++) {
-        int least = m[1][1][l] < m[0][0][l];
-        if (m[2][2][l] < m[least][least][l]) least = 2;
+        const int smaller = m[1][1][l] < m[0][0][l], least = m[2][2][l] < m[smaller][smaller][l] ? 2 : smaller;
         for (int a = 0; a < 3; a++) normal[a][l] = v[a][least][l];
     }
 }
@@ -251,9 +250,10 @@ static void moments(const tree *t, const int32_t *place, int32_t k, lanes m[3][3
 }
 
 /* Unit normals of m queries among n points from k of them (1 <= k <= n); order and turn are morton_order of points and
- * queries. Returns 0, or 1 when memory runs out. */
+ * queries. Returns 0, 1 when memory runs out, or 2 when anything lies beyond WIDEST. */
 int normals(const float *xyz, const int32_t *order, int32_t n, const float *queries, const int32_t *turn, int32_t m,
             int32_t k, float *out) {
+    if (!narrow(xyz, n) || !narrow(queries, m)) return 2;
     const size_t size = (size_t)n + LEAF;
     tree t = {.n = n, .twigs = (n + LEAF * LEAF - 1) / (LEAF * LEAF), .order = order};
     const size_t leaves = (size_t)t.twigs * LEAF, all = (size_t)t.twigs + t.twigs / LEAF + 1;
@@ -267,7 +267,7 @@ int normals(const float *xyz, const int32_t *order, int32_t n, const float *quer
         const float *p = xyz + 3 * (int64_t)order[i];
         t.x[i] = p[0], t.y[i] = p[1], t.z[i] = p[2];
     }
-    for (int32_t i = n; i < n + LEAF; i++) t.x[i] = t.y[i] = t.z[i] = FLT_MAX;
+    for (int32_t i = n; i < n + LEAF; i++) t.x[i] = t.y[i] = t.z[i] = FAR;
     fill_boxes(&t);
     lanes c[3][3] = {{{0}}}, normal[3];
     const float side = t.leaf->high[0][0] - t.leaf->low[0][0];
@@ -283,7 +283,7 @@ int normals(const float *xyz, const int32_t *order, int32_t n, const float *quer
         alone.reach = group.reach;
         if (group.reach >= LARGEST || !nearest(&t, p, k, &group, &guess, &near))
             nearest_alone(&t, p, k, &alone, &guess, &near);
-        guess = guess < LARGEST ? guess * MARGIN : FLT_MAX;
+        guess *= MARGIN;
         const int32_t lane = s % LANES;
         moments(&t, near.place, k, c, lane);
         if (lane < LANES - 1 && s < m - 1) continue;

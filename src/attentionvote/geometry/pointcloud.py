@@ -79,11 +79,13 @@ def estimate_normals(
         return estimate_normals_reference(points, asked, nearest)
     order, turn = (np.empty(len(a), dtype=np.int32) for a in (points, asked))
     clouds = [np.ascontiguousarray(a, dtype=np.float32) for a in (points, asked)]
-    for cloud, found in zip(clouds, (order, turn), strict=True):
-        native.call(libraries[0].morton_order, cloud, len(cloud), found)
     normals = np.empty_like(clouds[1])
-    native.call(libraries[1].normals, clouds[0], order, len(points), clouds[1], turn, len(asked), nearest, normals)
-    return normals
+    sort = libraries[0].morton_order
+    served = all(native.call(sort, c, len(c), found) for c, found in zip(clouds, (order, turn), strict=True))
+    arguments = clouds[0], order, len(points), clouds[1], turn, len(asked), nearest, normals
+    if served and native.call(libraries[1].normals, *arguments):
+        return normals
+    return estimate_normals_reference(points, asked, nearest)
 
 
 def estimate_normals_reference(

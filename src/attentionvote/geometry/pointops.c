@@ -4,6 +4,9 @@
  * references that the tests compare with. Compile with -O3 -ffinite-math-only -fno-signed-zeros: the running
  * maximum vectorises only then. Never with -ffast-math: linked into a shared object it makes GCC flush
  * subnormals to zero in the whole process.
+ *
+ * Infinities mean nothing under these flags, so none may arise: clouds beyond WIDEST, whose squares could overflow, are
+ * left to the references. Functions return 0, 1 when memory runs out, or 2 for such a cloud.
  */
 #include <float.h>
 #include <math.h>
@@ -16,11 +19,29 @@
 #define DIGIT 11 /* bits a pass of the sort */
 #define FEW 24   /* numbers that are sorted by insertion */
 #define CHUNK 64 /* distances at a time */
+#define WIDEST 1e18f     /* metres from the origin on an axis; normals.c has the same */
+#define ALL_INSIDE 4e18f /* no two points are as far apart */
 
 typedef struct {
     uint32_t key;
     int32_t index;
 } keyed;
+
+/* Lowest and highest coordinates of n points, zeros of none; whether all lie within WIDEST. */
+static int bounds(const float *xyz, int32_t n, float *low, float *high) {
+    float l[3] = {0, 0, 0}, h[3] = {0, 0, 0}; /* in registers */
+    for (int a = 0; a < 3 && n > 0; a++) l[a] = h[a] = xyz[a];
+    for (int32_t i = 0; i < n; i++)
+        for (int a = 0; a < 3; a++) {
+            const float v = xyz[3 * i + a];
+            l[a] = v < l[a] ? v : l[a];
+            h[a] = v > h[a] ? v : h[a];
+        }
+    memcpy(low, l, sizeof l), memcpy(high, h, sizeof h);
+    int fits = 1;
+    for (int a = 0; a < 3; a++) fits &= l[a] >= -WIDEST && h[a] <= WIDEST;
+    return fits;
+}
 
 static uint32_t spread(uint32_t v) { /* 10 bits, two zero bits between neighbours */
     v = (v | v << 16) & 0x030000ffu;
@@ -31,21 +52,15 @@ static uint32_t spread(uint32_t v) { /* 10 bits, two zero bits between neighbour
 }
 
 /* Indices of the points along a Morton curve through 1024 cells an axis, points of one cell in index order: points that
- * are near each other in space mostly are so in the order. Returns 0, or 1 when memory runs out. */
+ * are near each other in space mostly are so in the order. */
 int morton_order(const float *xyz, int32_t n, int32_t *order) {
+    float low[3], high[3];
+    if (!bounds(xyz, n, low, high)) return 2;
     keyed *from = malloc(sizeof(keyed) * ((size_t)n + 1)), *to = malloc(sizeof(keyed) * ((size_t)n + 1));
     if (!from || !to) {
         free(from), free(to);
         return 1;
     }
-    float low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
-    for (int a = 0; a < 3 && n > 0; a++) low[a] = high[a] = xyz[a];
-    for (int32_t i = 0; i < n; i++)
-        for (int a = 0; a < 3; a++) {
-            const float v = xyz[3 * i + a];
-            low[a] = v < low[a] ? v : low[a];
-            high[a] = v > high[a] ? v : high[a];
-        }
     float extent = 1e-12f;
     for (int a = 0; a < 3; a++)
         if (high[a] - low[a] > extent) extent = high[a] - low[a];
@@ -70,15 +85,16 @@ int morton_order(const float *xyz, int32_t n, int32_t *order) {
 
 /* Farthest-point order: order[0] = 0, then always the point farthest from all chosen ones, ties to the lowest
  * index. Points are sorted along a Morton curve into blocks with bounding boxes; a block is visited only when
- * the new sample can be nearer than the block's current maximum. Returns 0, or 1 when memory runs out. */
+ * the new sample can be nearer than the block's current maximum. */
 int farthest_point_order(const float *xyz, int32_t n, int32_t m, int32_t *order) {
     const int32_t blocks = (n + BLOCK - 1) / BLOCK, padded = blocks * BLOCK;
     float *soa = malloc(sizeof(float) * 4 * (size_t)padded);
     int32_t *original = malloc(sizeof(int32_t) * (size_t)padded);
     float *box = malloc(sizeof(float) * 8 * (size_t)blocks);
-    if (!soa || !original || !box || morton_order(xyz, n, original)) {
+    const int failed = soa && original && box ? morton_order(xyz, n, original) : 1;
+    if (failed) {
         free(soa), free(original), free(box);
-        return 1;
+        return failed;
     }
     for (int32_t i = n; i < padded; i++) original[i] = original[n - 1];
     float *x = soa, *y = soa + padded, *z = soa + 2 * padded, *d = soa + 3 * padded;
@@ -158,32 +174,26 @@ static int32_t smallest_in_order(int32_t *v, int32_t n, int32_t k, uint64_t *set
     return count;
 }
 
+/* Cells that a grid has, and how many along each axis; one when the cell is larger than the points' box. */
+static int64_t grid(const float *low, const float *high, double cell, int64_t *cells) {
+    for (int a = 0; a < 3; a++) cells[a] = (int64_t)(((double)high[a] - low[a]) / cell) + 1;
+    return cells[0] * cells[1] * cells[2];
+}
+
 /* For every centre the first k points in index order with distance <= radius, padded with the first; counts[c]
  * is the number of real neighbours (at most k). An empty ball has count 0 and index 0. */
 int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, float radius, int32_t k,
                int32_t *neighbors, int32_t *counts) {
-    float low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
-    for (int a = 0; a < 3 && n > 0; a++) low[a] = high[a] = xyz[a];
-    for (int32_t i = 0; i < n; i++)
-        for (int a = 0; a < 3; a++) {
-            const float v = xyz[3 * i + a];
-            if (v < low[a]) low[a] = v;
-            if (v > high[a]) high[a] = v;
-        }
-    float cell = radius;
-    int64_t cells[3], total;
-    for (;;) { /* a coarser cell is only slower, never wrong */
-        total = 1;
-        int fits = 1;
-        for (int a = 0; a < 3; a++) {
-            const double count = floor((double)(high[a] - low[a]) / cell) + 1;
-            if (count > MAX_CELLS_PER_AXIS) fits = 0;
-            cells[a] = count > MAX_CELLS_PER_AXIS ? MAX_CELLS_PER_AXIS : (int64_t)count;
-            total *= cells[a];
-        }
-        if (fits && total <= 8 * (int64_t)n + 64) break;
-        cell *= 1.5f;
-    }
+    float low[3], high[3], far[6];
+    if (!bounds(xyz, n, low, high) || !bounds(centers, m, far, far + 3)) return 2;
+    radius = radius < ALL_INSIDE ? radius : ALL_INSIDE;
+    double cell = radius;
+    for (int a = 0; a < 3; a++) cell = fmax(cell, ((double)high[a] - low[a]) / (MAX_CELLS_PER_AXIS - 1));
+    if (cell == 0) cell = 1;
+    int64_t cells[3];
+    while (grid(low, high, cell, cells) > 8 * (int64_t)n + 64) cell *= 1.5; /* coarser is slower, never wrong */
+    const int64_t total = grid(low, high, cell, cells);
+    const double inverse = 1 / cell;
     int32_t *start = calloc((size_t)total + 2, sizeof(int32_t));
     int32_t *cell_of = malloc(sizeof(int32_t) * ((size_t)n + 1));
     int32_t *sorted = malloc(sizeof(int32_t) * ((size_t)n + 1));
@@ -199,7 +209,7 @@ int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, flo
     for (int32_t i = 0; i < n; i++) {
         int64_t c[3];
         for (int a = 0; a < 3; a++) {
-            c[a] = (int64_t)((xyz[3 * i + a] - low[a]) / cell);
+            c[a] = (int64_t)(((double)xyz[3 * i + a] - low[a]) * inverse);
             if (c[a] >= cells[a]) c[a] = cells[a] - 1;
         }
         cell_of[i] = (int32_t)((c[2] * cells[1] + c[1]) * cells[0] + c[0]);
@@ -212,15 +222,15 @@ int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, flo
         x[slot] = xyz[3 * i], y[slot] = xyz[3 * i + 1], z[slot] = xyz[3 * i + 2];
     }
     const float squared = radius * radius;
+    /* Squares are rounded, tiny ones to multiples of 1e-45: a point on the border must not be lost. */
+    const double reach = radius * (1 + 1e-6) + 1e-22;
     for (int32_t q = 0; q < m; q++) {
         const float *p = centers + 3 * q;
         int64_t from[3], to[3];
         for (int a = 0; a < 3; a++) {
-            /* One cell of slack: rounding must not lose a point on the border. */
-            from[a] = (int64_t)floorf((p[a] - radius - low[a]) / cell * 0.999999f) - (p[a] - radius < low[a] ? 1 : 0);
-            to[a] = (int64_t)floorf((p[a] + radius - low[a]) / cell * 1.000001f);
-            if (from[a] < 0) from[a] = 0;
-            if (to[a] >= cells[a]) to[a] = cells[a] - 1;
+            const double first = (p[a] - reach - low[a]) * inverse, last = (p[a] + reach - low[a]) * inverse;
+            from[a] = first < 0 ? 0 : first < cells[a] ? (int64_t)first : cells[a];
+            to[a] = last < 0 ? -1 : last < cells[a] ? (int64_t)last : cells[a] - 1;
         }
         int32_t count = 0;
         for (int64_t cz = from[2]; cz <= to[2]; cz++)
@@ -253,8 +263,10 @@ int ball_query(const float *xyz, int32_t n, const float *centers, int32_t m, flo
  * with fewer than three sources the last one is repeated. */
 int three_nearest(const float *sources, int32_t n, const float *targets, int32_t m, int32_t *neighbors,
                   float *squared) {
+    float low[3], high[3];
+    if (!bounds(sources, n, low, high) || !bounds(targets, m, low, high)) return 2;
     for (int32_t t = 0; t < m; t++) {
-        float d[3] = {INFINITY, INFINITY, INFINITY};
+        float d[3] = {FLT_MAX, FLT_MAX, FLT_MAX};
         int32_t at[3] = {0, 0, 0};
         const float *p = targets + 3 * t;
         for (int32_t i = 0; i < n; i++) {

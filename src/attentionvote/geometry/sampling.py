@@ -2,7 +2,8 @@
 
 Each operator has a C implementation (``pointops.c``, compiled once per machine with the system's C compiler,
 no torch headers, no CUDA) and a slow numpy reference in ``sampling_reference``, which is its oracle in the
-tests and takes its place where no compiler is found. Both return the same indices.
+tests and takes its place where no compiler is found, or where points lie 1e18 m away, which a square in float32 may not
+hold. Both return the same indices.
 """
 
 from __future__ import annotations
@@ -32,11 +33,10 @@ def farthest_point_order(points: NDArray[np.float32], count: int) -> NDArray[np.
     if not 1 <= count <= len(xyz):
         raise ValueError(f"count must lie in 1..{len(xyz)} (the number of points), got {count}")
     library = native.load("attentionvote.geometry", "pointops.c")
-    if library is None:
-        return sampling_reference.farthest_point_order(xyz, count)
     order = np.empty(count, dtype=np.int32)
-    native.call(library.farthest_point_order, xyz, len(xyz), count, order)
-    return order.astype(np.int64)
+    if library is not None and native.call(library.farthest_point_order, xyz, len(xyz), count, order):
+        return order.astype(np.int64)
+    return sampling_reference.farthest_point_order(xyz, count)
 
 
 def ball_query(
@@ -66,12 +66,12 @@ def ball_query(
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     library = native.load("attentionvote.geometry", "pointops.c")
-    if library is None:
-        return sampling_reference.ball_query(xyz, middle, radius, count)
     neighbors = np.empty((len(middle), count), dtype=np.int32)
     found = np.empty(len(middle), dtype=np.int32)
-    native.call(library.ball_query, xyz, len(xyz), middle, len(middle), float(radius), count, neighbors, found)
-    return neighbors.astype(np.int64), found.astype(np.int64)
+    arguments = xyz, len(xyz), middle, len(middle), float(radius), count, neighbors, found
+    if library is not None and native.call(library.ball_query, *arguments):
+        return neighbors.astype(np.int64), found.astype(np.int64)
+    return sampling_reference.ball_query(xyz, middle, radius, count)
 
 
 def level_neighbors(
@@ -108,12 +108,11 @@ def three_nearest(
     """
     xyz, goal = _checked("sources", sources), _checked("targets", targets, empty=True)
     library = native.load("attentionvote.geometry", "pointops.c")
-    if library is None:
-        return sampling_reference.three_nearest(xyz, goal)
     neighbors = np.empty((len(goal), 3), dtype=np.int32)
     squared = np.empty((len(goal), 3), dtype=np.float32)
-    native.call(library.three_nearest, xyz, len(xyz), goal, len(goal), neighbors, squared)
-    return neighbors.astype(np.int64), np.sqrt(squared)
+    if library is not None and native.call(library.three_nearest, xyz, len(xyz), goal, len(goal), neighbors, squared):
+        return neighbors.astype(np.int64), np.sqrt(squared)
+    return sampling_reference.three_nearest(xyz, goal)
 
 
 def _checked(name: str, points: NDArray, empty: bool = False) -> NDArray[np.float32]:

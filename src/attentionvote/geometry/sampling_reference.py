@@ -1,9 +1,15 @@
-"""Slow, plain numpy versions of the operators in ``sampling``: their oracle, their stand-in without a compiler."""
+"""Slow, plain numpy versions of the operators in ``sampling``: their oracle, their stand-in without a compiler.
+
+A squared distance that overflows counts as the largest number that float32 has: farther than all others, and never
+within a radius.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+_LARGEST = np.finfo(np.float32).max
 
 
 def farthest_point_order(points: NDArray[np.float32], count: int) -> NDArray[np.int64]:
@@ -22,7 +28,8 @@ def ball_query(
     """See ``sampling.ball_query``; one pass over all points for every centre."""
     neighbors = np.zeros((len(centers), count), dtype=np.int64)
     found = np.zeros(len(centers), dtype=np.int64)
-    limit = np.float32(radius) * np.float32(radius)
+    with np.errstate(over="ignore"):
+        limit = min(np.square(np.float32(radius)), np.nextafter(_LARGEST, np.float32(0)))
     for row, center in enumerate(centers):
         inside = np.flatnonzero(_squared(points, center) <= limit)[:count]
         if len(inside):
@@ -48,5 +55,6 @@ def three_nearest(
 
 def _squared(points: NDArray[np.float32], center: NDArray[np.float32]) -> NDArray[np.float32]:
     # The same order of float32 operations as the C code, so that ties and borders fall alike.
-    dx, dy, dz = (points[:, axis] - center[axis] for axis in range(3))
-    return dx * dx + dy * dy + dz * dz
+    with np.errstate(over="ignore"):
+        dx, dy, dz = (points[:, axis] - center[axis] for axis in range(3))
+        return np.minimum(dx * dx + dy * dy + dz * dz, _LARGEST)

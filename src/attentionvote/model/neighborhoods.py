@@ -73,11 +73,13 @@ class Neighborhoods(NamedTuple):
             ),
         )
 
-    def to(self, device: torch.device | str) -> Neighborhoods:
-        """The same on another device."""
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Neighborhoods:
+        """The same on another device; the weights in the precision of ``dtype`` where that is given."""
         return Neighborhoods(
             self.order.to(device),
-            *(tuple(t.to(device) for t in getattr(self, name)) for name in ("neighbors", "nearest", "weights")),
+            tuple(t.to(device) for t in self.neighbors),
+            tuple(t.to(device) for t in self.nearest),
+            tuple(t.to(device, dtype) for t in self.weights),
         )
 
 
@@ -109,6 +111,6 @@ def find_neighborhoods(points: NDArray[np.float32], layout: Layout) -> Neighborh
 
 
 def find_batch(points: Tensor, layout: Layout) -> Neighborhoods:
-    """Neighbourhoods of a batch of points ``(batch, N, 3)``, on the device of the points."""
-    samples = [find_neighborhoods(p, layout) for p in points.detach().cpu().numpy()]
-    return Neighborhoods.stack(samples).to(points.device)
+    """Neighbourhoods of a batch of points ``(batch, N, 3)``, on the device and in the precision of the points."""
+    samples = [find_neighborhoods(p, layout) for p in points.detach().float().cpu().numpy()]
+    return Neighborhoods.stack(samples).to(points.device, points.dtype)

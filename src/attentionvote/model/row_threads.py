@@ -23,7 +23,7 @@ def thread_count(rows: int, least: int = LEAST_ROWS) -> int:
     return max(1, min(torch.get_num_threads(), rows // least))
 
 
-def in_threads(rows: int, work: Callable[[int, int, int], None], least: int = LEAST_ROWS) -> None:
+def in_threads(rows: int, work: Callable[[int, int, int], object], least: int = LEAST_ROWS) -> None:
     """``work(share, start, stop)`` over equal shares of the rows, ``thread_count(rows, least)`` of them at once.
 
     Which rows a share has depends on nothing but their number and that of the threads. What ``work`` raises is raised

@@ -108,7 +108,7 @@ class AttentionVoteLoss:
         index = instance.clamp(min=0)
         rows = torch.arange(len(index), device=index.device)[:, None]
         aim, part = batch.center[rows, index], batch.part[rows, index]
-        error = ((votes.xyz - aim).square().sum(-1) + 1e-12).sqrt() / self._unit(part)
+        error = ((votes.xyz - aim).square().sum(-1) + 1e-12).sqrt() / self._unit(part, votes.xyz)
         terms = {"vote": masked_mean(error, on_part)}
         if votes.rotation is not None:
             turn = self.training_pose.rotation_loss(
@@ -130,14 +130,14 @@ class AttentionVoteLoss:
         # Padding has visibility 0 and lies at the origin.
         distance = distance.masked_fill((visible <= 0) | (visible < self.settings.least_visible), torch.inf)
         nearest, instance = distance.min(dim=1)
-        limit = self.settings.assignment * self.true_pose.diameter(batch.part[sample, instance])
+        limit = self.settings.assignment * self.true_pose.diameter(batch.part[sample, instance], seed.dtype)
         return Assignment(sample, instance, nearest < limit)
 
     def proposal_terms(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
         """Eq. (9) of the positive proposals, term by term, mean over them."""
         part, center, rotation = self._truth(assigned, batch)
         settings = self.settings
-        apart = ((poses.center - center).square().sum(-1) + 1e-12).sqrt() / self._unit(part)
+        apart = ((poses.center - center).square().sum(-1) + 1e-12).sqrt() / self._unit(part, poses.center)
         turn = self.training_pose.rotation_loss(settings.rotation, part, poses.quaternion, poses.rotation, rotation)
         terms = {"center": masked_mean(apart, assigned.positive), "rotation": masked_mean(turn, assigned.positive)}
         semantic = torch.zeros_like(apart)
@@ -157,7 +157,7 @@ class AttentionVoteLoss:
         part, center, rotation = self._truth(assigned, batch)
         turn = self.training_pose.squared_turn(part, poses.rotation, rotation)
         squared = turn + (poses.center - center).square().sum(-1)
-        return masked_mean((squared + 1e-10).sqrt() / self._unit(part), assigned.positive)
+        return masked_mean((squared + 1e-10).sqrt() / self._unit(part, poses.center), assigned.positive)
 
     def quality_term(self, poses: Poses, assigned: Assignment, batch: Batch) -> dict[str, Tensor]:
         """Cross entropy between the predicted and the measured quality of every proposal."""
@@ -177,8 +177,8 @@ class AttentionVoteLoss:
         if poses.class_logits.shape[1] > 1:
             right = right & (poses.class_logits.argmax(1) == part)
         distance = distance.masked_fill(~right, torch.inf)
-        share = distance / self.true_pose.diameter(part)
-        quality = (share[:, None] < torch.tensor(QUALITY_STEPS, device=share.device)).to(poses.score.dtype).mean(1)
+        share = distance / self.true_pose.diameter(part, distance.dtype)
+        quality = (share[:, None] < share.new_tensor(QUALITY_STEPS)).to(poses.score.dtype).mean(1)
         if not self.settings.one_per_instance:
             return quality
         key = assigned.sample * batch.visible.shape[1] + assigned.instance
@@ -191,9 +191,9 @@ class AttentionVoteLoss:
         at = assigned.sample, assigned.instance
         return batch.part[at], batch.center[at], batch.rotation[at]
 
-    def _unit(self, part: Int[Tensor, "*rows"]) -> Float[Tensor, "*rows"] | float:
-        """0.1 D of every row's part, metres."""
-        return 0.1 * self.true_pose.diameter(part)
+    def _unit(self, part: Int[Tensor, "*rows"], lengths: Tensor) -> Float[Tensor, "*rows"] | float:
+        """0.1 D of every row's part, metres, in the precision of the ``lengths`` that it divides."""
+        return 0.1 * self.true_pose.diameter(part, lengths.dtype)
 
 
 def batch_loss(

@@ -95,8 +95,14 @@ class PoseTraining(L.LightningModule):
     def predict(self, batch: Batch) -> Predictions:
         """What the network answers; never with the larger radius of the warm-up."""
         self.model.voting_radius = self.voting_radius
+        batch = self.fitting(batch)
         predictions: Predictions = self.model(batch.points, batch.normals, batch.found)
         return predictions
+
+    def fitting(self, batch: Batch) -> Batch:
+        """The batch on the device and in the precision of the network; a loader's is float32 on the CPU."""
+        weight = next(self.model.parameters())
+        return batch.to(weight.device, weight.dtype)
 
     def detect(self, batch: Batch) -> list[SceneResult]:
         """Detections of a batch beside its truth."""

@@ -30,11 +30,11 @@ class PartPoses:
         """Those of a part or a set of parts, see ``SymmetricPose.of``."""
         return cls(tuple(SymmetricPose.of(one, isotropic) for one in part.parts))
 
-    def diameter(self, part: Int[Tensor, "*rows"]) -> Float[Tensor, "*rows"] | float:
-        """D in metres of every row's part; one number where all are the same."""
+    def diameter(self, part: Int[Tensor, "*rows"], dtype: torch.dtype) -> Float[Tensor, "*rows"] | float:
+        """D in metres of every row's part, in the precision of ``dtype``; one number where all are the same."""
         if len(self.each) == 1:
             return self.each[0].diameter
-        return self._diameters.to(part.device)[part]
+        return self._diameters.to(dtype).to(part.device)[part]
 
     def squared_turn(
         self, part: Int[Tensor, " rows"], predicted: Float[Tensor, "rows 3 3"], true: Float[Tensor, "rows 3 3"]
@@ -42,10 +42,10 @@ class PartPoses:
         """As ``SymmetricPose.squared_turn``, by each row's own part."""
         if len(self.each) == 1:
             return self.each[0].squared_turn(predicted, true)
-        representation, equivalents = (table.to(true.device)[part] for table in self._tables)
+        representation, equivalents = (t.to(predicted.dtype).to(true.device)[part] for t in self._tables)
         with full_precision(true.device):
-            aims = true[:, None] @ equivalents.to(true.dtype)
-            now = (predicted @ representation.to(true.dtype))[:, None]
+            aims = true[:, None] @ equivalents
+            now = (predicted @ representation)[:, None]
             return (now - aims).square().sum((-2, -1)).amin(1)
 
     def distance(
@@ -75,7 +75,7 @@ class PartPoses:
         if len(self.each) == 1:
             return self.each[0].rotation_loss(kind, quaternion, rotation, true)
         if kind == "metric":
-            diameter = self.diameter(part)
+            diameter = self.diameter(part, rotation.dtype)
             return (self.squared_turn(part, rotation, true) + (_TINY * diameter) ** 2).sqrt() / (0.1 * diameter)
         # Quaternion forms enumerate the equivalents in numpy: part by part is no slower.
         loss = rotation.new_zeros(len(part))
@@ -86,7 +86,7 @@ class PartPoses:
 
     @cached_property
     def _diameters(self) -> Tensor:
-        return torch.tensor([pose.diameter for pose in self.each], dtype=torch.float32)
+        return torch.tensor([pose.diameter for pose in self.each], dtype=torch.float64)
 
     @cached_property
     def _tables(self) -> tuple[Tensor, Tensor]:
@@ -94,7 +94,7 @@ class PartPoses:
         most = max(len(pose.group) for pose in self.each)
         representations, equivalents = [], []
         for pose in self.each:
-            representation = torch.zeros(3, 3)
+            representation = torch.zeros(3, 3, dtype=torch.float64)
             representation[:, : pose.representation.shape[1]] = pose.representation
             turned = pose.group @ representation
             representations.append(representation)

@@ -62,10 +62,11 @@ def picture_inputs(module: PoseTraining, batch: Batch, confidence_threshold: flo
     """For every sample of a batch the arguments of ``tracking.scene_pictures.scene_picture``.
 
     Args:
-        module: the trained module, on the device of the batch.
+        module: the trained module.
         batch: fixed scenes.
         confidence_threshold: detections below it are not drawn.
     """
+    batch = module.fitting(batch)
     results = module.detect(batch)
     votes = module.model.cast_votes(batch.points, batch.normals, batch.found)
     peaks = module.model.find_peaks(votes)

@@ -35,6 +35,8 @@ class SymmetricPose:
         representation: ``(3, c)`` metres; two rotations differ by ``|(R1 - R2 g) representation|``, minimum over g:
             Lambda for a finite group, lambda times the axis for a body of revolution.
         axis: ``(3,)`` of a body of revolution, None otherwise.
+
+    Tables are kept in double precision; every loss is computed in that of the predictions.
     """
 
     diameter: float
@@ -52,21 +54,25 @@ class SymmetricPose:
             along = np.linalg.norm(part.covariance_root @ direction)
             across = np.sqrt(max(np.trace(part.covariance_root @ part.covariance_root) - along**2, 0.0) / 2)
             root = (np.hypot(along, across) * direction)[:, None]
-            axis = torch.tensor(direction, dtype=torch.float32)
-        group = torch.tensor(part.symmetry.rotations(), dtype=torch.float32)
-        return cls(part.diameter, group, torch.tensor(root, dtype=torch.float32), axis)
+            axis = torch.tensor(direction, dtype=torch.float64)
+        group = torch.tensor(part.symmetry.rotations(), dtype=torch.float64)
+        return cls(part.diameter, group, torch.tensor(root, dtype=torch.float64), axis)
 
-    def to(self, device: torch.device) -> SymmetricPose:
-        """The same on another device."""
-        axis = None if self.axis is None else self.axis.to(device)
-        return SymmetricPose(self.diameter, self.group.to(device), self.representation.to(device), axis)
+    def like(self, values: Tensor) -> SymmetricPose:
+        """The same on the device and in the precision of ``values``."""
+
+        def alike(table: Tensor) -> Tensor:
+            return table.to(values.dtype).to(values.device)  # narrowed first: not every device knows double precision
+
+        axis = None if self.axis is None else alike(self.axis)
+        return SymmetricPose(self.diameter, alike(self.group), alike(self.representation), axis)
 
     def squared_turn(
         self, predicted: Float[Tensor, "rows 3 3"], true: Float[Tensor, "rows 3 3"]
     ) -> Float[Tensor, " rows"]:
         """Square of the rotational distance in square metres, minimum over the symmetry group."""
         with full_precision(true.device):
-            own = self.to(true.device)
+            own = self.like(predicted)
             aims = true[:, None] @ (own.group @ own.representation)
             return (predicted[:, None] @ own.representation - aims).square().sum((-2, -1)).amin(1)
 
@@ -96,7 +102,7 @@ class SymmetricPose:
             return (self.squared_turn(rotation, true) + (_TINY * self.diameter) ** 2).sqrt() / (0.1 * self.diameter)
         if kind not in get_args(RotationLoss):
             raise ValueError(f"rotation loss must be one of {', '.join(get_args(RotationLoss))}, got {kind!r}")
-        own = self.to(true.device)
+        own = self.like(rotation)
         if own.axis is not None:
             with full_precision(true.device):
                 aims = torch.einsum("rij,gjk,k->rgi", true, own.group, own.axis)
@@ -109,7 +115,7 @@ class SymmetricPose:
         Eq. (6) depends on becomes part of the label."""
         matrices = true[:, None].detach().cpu().numpy() @ self.group.cpu().numpy()
         quaternions = canonical_quaternion(quaternion_from_matrix(matrices))
-        return torch.from_numpy(quaternions.astype(np.float32)).to(true.device)
+        return torch.from_numpy(quaternions).to(true.dtype).to(true.device)
 
 
 def quaternion_loss(
