@@ -20,8 +20,8 @@ from attentionvote.geometry.pose import apply, inverse
 from attentionvote.geometry.sampling import level_neighbors
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scale_check import check_scene, check_unit
+from attentionvote.inference.scans.limits import MOST_POINTS
 
-MOST_POINTS = 4_000_000
 SEED = 0
 _FARTHEST = 20
 
@@ -88,6 +88,13 @@ class Crop:
             raise InputError(
                 f"bin margin must be metres from 0 to less than half the bin's smallest side ({size.min() / 2:g}), "
                 f"got {self.margin}"
+            )
+        camera_height = float(inverse(pose)[2, 3])
+        if camera_height <= size[2]:
+            raise InputError(
+                f"bin camera_from_bin must have the camera above the opening ({size[2]:g} m over the floor, z up), "
+                f"got it at {camera_height:.4g} m: is the bin's frame upside down, or is this bin_from_camera? "
+                "turn it, or invert the matrix"
             )
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -177,7 +184,7 @@ def checked_cloud(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
     """The measured points ``(P, 3)`` float32 of a cloud and how many places it had.
 
     Raises:
-        InputError: on another shape or type, too many points, or values that are not finite.
+        InputError: on another shape or type, or too many measured points.
     """
     if not isinstance(points, np.ndarray) or points.ndim not in (2, 3) or points.shape[-1] != 3:
         shape = points.shape if isinstance(points, np.ndarray) else type(points).__name__
@@ -187,19 +194,10 @@ def checked_cloud(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
             f"points must be floating-point metres, got {points.dtype}: divide counts by their scale first"
         )
     given = points.size // 3
-    if given > MOST_POINTS:
-        raise InputError(f"points must be at most {MOST_POINTS}, got {given}: crop or thin the cloud out")
-    flat = points.reshape(-1, 3)
-    if points.ndim == 3:
-        flat = flat[~np.isnan(flat).any(axis=1)]
     with np.errstate(over="ignore"):
-        cloud = flat.astype(np.float32)
-    if not np.isfinite(cloud).all():
-        finite = np.isfinite(cloud).all(axis=1)
-        remedy = "drop them, or send the organised cloud (H, W, 3) in which NaN is missing"
-        if points.ndim == 3:
-            remedy = "in an organised cloud a missing point is NaN"
-        raise InputError(f"points must be finite, got {int((~finite).sum())} of {given} with NaN or inf: {remedy}")
-    if not cloud[:, 2].all():  # a missing point is at the camera; few sensors send any
-        cloud = cloud[cloud.any(axis=1)]
+        cloud = points.reshape(-1, 3).astype(np.float32)
+    # Missing: not finite, or exactly at the camera.
+    cloud = cloud[np.isfinite(cloud).all(axis=1) & cloud.any(axis=1)]
+    if len(cloud) > MOST_POINTS:
+        raise InputError(f"points must be at most {MOST_POINTS}, got {len(cloud)}: crop or thin the cloud out")
     return np.ascontiguousarray(cloud), given
