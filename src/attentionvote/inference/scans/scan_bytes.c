@@ -203,6 +203,8 @@ int number_rows(const uint8_t *text, int64_t size, int64_t width, const int64_t 
             state[DETAIL] = field;
             break;
         }
+        if (at < size && text[at] == '\r') at++;
+        if (at < size && text[at] == '\n') at++;
         done++;
     }
     state[AT] = at;

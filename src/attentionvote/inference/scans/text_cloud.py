@@ -64,10 +64,9 @@ def _row_layout(line: bytes, header: bytes) -> RowLayout | None:
     """What a row of numbers looks like; None when the line is none."""
     mark = next((mark for mark in (b";", b",") if mark in line), b"")
     fields = _fields(line, mark)
-    if b"," in line and (mark == b";" or any(b" " in field or b"\t" in field for field in fields)):
-        if _DECIMAL_COMMAS.fullmatch(line):
-            raise ValueError("its numbers must have decimal points, got commas: write 0.5, not 0,5")
-        return None
+    mixed = b"," in line and (mark == b";" or any(b" " in field or b"\t" in field for field in fields))
+    if mixed and _DECIMAL_COMMAS.fullmatch(line):
+        raise ValueError("its numbers must have decimal points, got commas: write 0.5, not 0,5")
     if not 3 <= len(fields) <= _MOST_FIELDS:
         return None
     columns = _columns(_fields(header, mark), len(fields))
