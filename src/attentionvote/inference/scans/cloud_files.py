@@ -16,6 +16,7 @@ from attentionvote.inference.scans.file_bytes import Content, content_view
 from attentionvote.inference.scans.limits import MOST_POINTS, Budget
 from attentionvote.inference.scans.measured_points import cloud_of, count_measured
 from attentionvote.inference.scans.other_kinds import other_kind
+from attentionvote.inference.scans.sentences import one_line
 from attentionvote.inference.scans.text_cloud import points_from_text, text_rows_start
 
 _COLUMNS = (3, 4, 6)  # x y z; and an intensity; and a normal or a colour
@@ -42,13 +43,13 @@ def read_cloud(
     try:
         cloud = _cloud(content, budget or Budget())
         if cloud is None:
-            raise InputError(_unknown(content, name))
+            raise InputError(one_line(_unknown(content, name)))
         if (measured := count_measured(cloud)) > most_points:
             raise ValueError(f"it must have at most {most_points} measured points, got {measured}: crop or thin it out")
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"{name} must be a point cloud, but {error}") from error
+        raise InputError(one_line(f"{name} must be a point cloud, but {error}")) from error
     return cloud
 
 
