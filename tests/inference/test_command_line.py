@@ -119,6 +119,20 @@ def test_warnings_go_to_stderr(command: Command, tmp_path: Path, bundle_folder: 
     assert "warning" not in out
 
 
+def test_a_cloud_in_the_cells_unit(
+    command: Command, tmp_path: Path, bundle_folder: Path, make_cloud: MakeCloud
+) -> None:
+    np.save(tmp_path / "scan.npy", make_cloud() * np.float32(1000))
+    (tmp_path / "cell.json").write_text('{"cloud": {"unit": "mm"}}')
+    words = ["estimate", tmp_path / "scan.npy", "--bundle", bundle_folder, "--json"]
+    code, _, err = command(*words)
+    assert code == 2
+    assert "were millimetres sent?" in one_sentence(err)
+    code, out, _ = command(*words, "--cell", tmp_path / "cell.json")
+    assert code == 0
+    assert json.loads(out)["poses"]
+
+
 def test_a_depth_image_with_the_cells_camera_and_bin(command: Command, tmp_path: Path, bundle_folder: Path) -> None:
     depth = (8000 + 100 * np.random.default_rng(0).random((60, 80))).astype(np.uint16)
     depth[:, :40] = 9000  # the floor beside the bin

@@ -171,7 +171,7 @@ def _estimate(options: argparse.Namespace) -> int:
             raise InputError(f"{name} is a depth image and needs its camera: describe it in a cell file, --cell FILE")
         given: dict[str, Any] = {"depth": read_depth(content, name), "camera": cell.camera}
     else:
-        given = {"points": read_cloud(content, name)}
+        given = {"points": cell.cloud.metres(read_cloud(content, name))}
     with PoseEstimator(options.bundle, threads=options.threads, crop=cell.crop, trusted=_trusted(options)) as estimator:
         answer = estimator.estimate(**given, deadline_s=deadline_s)
     if options.json:

@@ -45,7 +45,8 @@ def mark_missing(points: NDArray[np.float32]) -> None:
     missing = ~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
     missing |= (x == 0) & (y == 0) & (z == 0)
     if missing.any():
-        points[missing] = np.nan
+        for axis in (x, y, z):  # whole rows at once take twice the time
+            axis[missing] = np.nan
 
 
 def count_measured(points: NDArray[np.float32]) -> int:
