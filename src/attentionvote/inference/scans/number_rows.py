@@ -7,7 +7,6 @@ accept the same: what ``float`` accepts, but for underscores. Lines end with LF,
 from __future__ import annotations
 
 import ctypes
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
@@ -25,7 +24,7 @@ _PIECE_BYTES = 64 * 1024
 _OTHER_WIDTH = 1
 _NOTHING = (-1, -1, -1)
 # Zeros pad some writers' files to whole blocks.
-_CONTENT = re.compile(rb"[^ \t\r\n\v\f\0]")
+_PADDING = b"\0 \t\r\n\v\f"
 
 
 @dataclass(frozen=True)
@@ -83,9 +82,17 @@ def all_number_rows(text: memoryview, layout: RowLayout, budget: Budget) -> NDAr
     return rows[: _reader(text, budget).read(most, layout, rows)]
 
 
-def anything_behind(text: memoryview, at: int) -> bool:
-    """Whether something but blanks and zeros follows a place in a file."""
-    return _CONTENT.search(text, at) is not None
+def anything_behind(content: memoryview, at: int, budget: Budget) -> bool:
+    """Whether something but blanks and zeros follows a byte of a file.
+
+    Raises:
+        ValueError: when the budget's time is spent.
+    """
+    for start in range(at, len(content), MIB):
+        budget.check_time()
+        if bytes(content[start : start + MIB]).strip(_PADDING):
+            return True
+    return False
 
 
 def _most_lines(text: memoryview, budget: Budget) -> int:

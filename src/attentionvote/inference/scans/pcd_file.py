@@ -77,7 +77,7 @@ def points_from_pcd(content: memoryview, budget: Budget) -> NDArray[np.float32]:
         return np.zeros((0, 3), np.float32)
     read = {b"ascii": _from_text, b"binary": _from_rows, b"binary_compressed": _from_columns}[data.group(1)]
     cloud, end = read(content[data.end() :], layout, budget)
-    if anything_behind(content, data.end() + end):
+    if anything_behind(content, data.end() + end, budget):
         raise ValueError(f"its header promises {layout.points} points, but more follows them: mend POINTS and WIDTH")
     in_camera_frame(cloud, viewpoint, budget)
     return cloud.reshape(layout.height, layout.width, 3) if layout.height > 1 else cloud

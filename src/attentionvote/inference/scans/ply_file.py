@@ -49,7 +49,7 @@ def points_from_ply(content: memoryview, budget: Budget) -> NDArray[np.float32]:
         return np.zeros((0, 3), np.float32)
     read = _from_rows if _FORMATS[order] else _from_text
     cloud, end = read(content, start, order, before, vertex, axes, budget)
-    if not any(element.count for element in behind) and anything_behind(content, end):
+    if not any(element.count for element in behind) and anything_behind(content, end, budget):
         raise ValueError(f"its header promises {vertex.count} vertices and nothing else, but more follows them")
     return cloud
 
