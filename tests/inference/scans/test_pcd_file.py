@@ -142,6 +142,8 @@ def test_more_points_than_promised_are_refused_and_padding_is_not(kind: str) -> 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_empty_cloud_is_a_cloud(kind: str) -> None:
     assert read_cloud(pcd(POINTS[:0], kind)).shape == (0, 3)
+    with pytest.raises(InputError, match="promises 0 points, but more follows them"):
+        read_cloud(pcd(POINTS[:0], kind) + b"1 2 3\n")
 
 
 PCD, PACKED = pcd(POINTS, "binary"), pcd(POINTS, "binary_compressed")

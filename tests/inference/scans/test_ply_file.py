@@ -97,6 +97,15 @@ def test_more_than_the_header_promises_is_refused_where_nothing_may_follow(order
             read_cloud(alone + more)
 
 
+def test_points_of_a_file_that_promises_none_are_refused() -> None:
+    header = (
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    assert read_cloud(header + b"\n").shape == (0, 3)
+    with pytest.raises(InputError, match="promises 0 vertices and nothing else, but more follows them"):
+        read_cloud(header + b"1 2 3\n")
+
+
 def test_lists_before_the_vertices_are_skipped_in_a_text_only() -> None:
     header = b"ply\nformat %s 1.0\nelement strip 2\nproperty list uchar int a\n"
     header += b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"

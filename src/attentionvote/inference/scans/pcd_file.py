@@ -73,10 +73,9 @@ def points_from_pcd(content: memoryview, budget: Budget) -> NDArray[np.float32]:
         raise ValueError("its header must end with DATA ascii, binary or binary_compressed")
     layout = _layout(head[: data.start()].decode("latin-1"))
     viewpoint = viewpoint_pose(layout.viewpoint)
-    if not layout.points:
-        return np.zeros((0, 3), np.float32)
     read = {b"ascii": _from_text, b"binary": _from_rows, b"binary_compressed": _from_columns}[data.group(1)]
-    cloud, end = read(content[data.end() :], layout, budget)
+    empty = np.zeros((0, 3), np.float32), 0
+    cloud, end = read(content[data.end() :], layout, budget) if layout.points else empty
     if anything_behind(content, data.end() + end, budget):
         raise ValueError(f"its header promises {layout.points} points, but more follows them: mend POINTS and WIDTH")
     in_camera_frame(cloud, viewpoint, budget)

@@ -45,11 +45,12 @@ def points_from_ply(content: memoryview, budget: Budget) -> NDArray[np.float32]:
         raise ValueError("its header has no element vertex")
     axes = _axes(vertex)
     before, behind = elements[: elements.index(vertex)], elements[elements.index(vertex) + 1 :]
-    if not vertex.count:
-        return np.zeros((0, 3), np.float32)
-    read = _from_rows if _FORMATS[order] else _from_text
-    cloud, end = read(content, start, order, before, vertex, axes, budget)
-    if not any(element.count for element in behind) and anything_behind(content, end, budget):
+    cloud, end = np.zeros((0, 3), np.float32), start
+    if vertex.count:
+        read = _from_rows if _FORMATS[order] else _from_text
+        cloud, end = read(content, start, order, before, vertex, axes, budget)
+    alone = not any(element.count for element in behind) and (vertex.count or not any(e.count for e in before))
+    if alone and anything_behind(content, end, budget):
         raise ValueError(f"its header promises {vertex.count} vertices and nothing else, but more follows them")
     return cloud
 
