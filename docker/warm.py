@@ -17,6 +17,12 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # before onnxruntime is imported
 import attentionvote.inference
 from attentionvote.geometry import native
 
+# Package and name of each file of C code that a cell calls.
+FILES = (
+    ("attentionvote.geometry", "pointops.c"),
+    ("attentionvote.geometry", "normals.c"),
+    ("attentionvote.inference.scans", "scan_bytes.c"),
+)
 # What uvicorn, Pillow and the health check import while they run.
 LATE = (
     "uvicorn.protocols.http.h11_impl",
@@ -33,8 +39,8 @@ def main() -> None:
     The bytecode is not compared with its source's date: copies between layers change dates, and nothing changes in a
     read-only image.
     """
-    for file in ("pointops.c", "normals.c"):
-        if native.load("attentionvote.geometry", file) is None:
+    for package, file in FILES:
+        if native.load(package, file) is None:
             sys.exit(f"warm: {file} was not compiled")
     for module in pkgutil.walk_packages(attentionvote.inference.__path__, "attentionvote.inference."):
         importlib.import_module(module.name)

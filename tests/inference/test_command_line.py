@@ -17,6 +17,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from attentionvote.inference import command_line
 from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.inference.command_line import main
 
@@ -117,6 +118,33 @@ def test_warnings_go_to_stderr(command: Command, tmp_path: Path, bundle_folder: 
     assert code == 0
     assert "warning: the scene lies farther than trained" in one_sentence(err)
     assert "warning" not in out
+
+
+def test_a_cloud_in_the_cells_unit(
+    command: Command, tmp_path: Path, bundle_folder: Path, make_cloud: MakeCloud
+) -> None:
+    np.save(tmp_path / "scan.npy", make_cloud() * np.float32(1000))
+    (tmp_path / "cell.json").write_text('{"cloud": {"unit": "mm"}}')
+    words = ["estimate", tmp_path / "scan.npy", "--bundle", bundle_folder, "--json"]
+    code, _, err = command(*words)
+    assert code == 2
+    assert "were millimetres sent?" in one_sentence(err)
+    code, out, _ = command(*words, "--cell", tmp_path / "cell.json")
+    assert code == 0
+    assert json.loads(out)["poses"]
+
+
+def test_reading_has_the_command_lines_own_budget(
+    command: Command, tmp_path: Path, bundle_folder: Path, make_cloud: MakeCloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.savetxt(tmp_path / "scan.xyz", make_cloud(1000), "%.6f")
+    words = ["estimate", tmp_path / "scan.xyz", "--bundle", bundle_folder, "--json"]
+    code, out, _ = command(*words)
+    assert (code, json.loads(out)["points_given"]) == (0, 1000)
+    monkeypatch.setattr(command_line, "_MOST_READING_S", 0.0)
+    code, _, err = command(*words)
+    assert code == 2
+    assert "must be read within 0 s of processor time" in one_sentence(err)
 
 
 def test_a_depth_image_with_the_cells_camera_and_bin(command: Command, tmp_path: Path, bundle_folder: Path) -> None:

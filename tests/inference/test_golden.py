@@ -57,7 +57,7 @@ def test_a_bundle_passes_its_own_clouds(make_bundle: MakeBundle, trusted_key: Pa
 
 
 def test_the_cells_crop_is_not_applied(tried: Try) -> None:
-    assert tried(crop=Crop(transform(np.eye(3), [0, 0, 2.0]), np.full(3, 0.2))) == []
+    assert tried(crop=Crop(transform(np.diag([1, -1, -1]), [0, 0, 2.0]), np.full(3, 0.2))) == []
 
 
 def test_within_the_tolerances_nothing_is_said(tried: Try) -> None:

@@ -143,14 +143,31 @@ def test_a_crop_keeps_what_lies_between_the_walls_above_the_floor() -> None:
 def test_a_crop_moves_with_the_bin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     turn = rotation_about(rng.normal(size=3), rng.uniform(0, 6))
-    moved = transform(turn, rng.normal(size=3))
-    here, there = Crop(np.eye(4), np.array([0.3, 0.2, 0.1])), Crop(moved, np.array([0.3, 0.2, 0.1]))
+    # The camera is anywhere above the opening, whichever way it looks.
+    camera = np.array([*rng.normal(size=2), rng.uniform(0.11, 2)])
+    moved = transform(turn, -turn @ camera)
+    there = Crop(moved, np.array([0.3, 0.2, 0.1]))
     points = rng.uniform(-0.2, 0.2, (200, 3)).astype(np.float32)
     edge = np.abs(np.abs(points) - [0.148, 0.098, 0.1]).min(axis=1) < 1e-5
     edge |= np.abs(points[:, 2] - 0.002) < 1e-5
-    expected = here.inside(points)
+    expected = (np.abs(points[:, 0]) <= 0.148) & (np.abs(points[:, 1]) <= 0.098)
+    expected &= (points[:, 2] >= 0.002) & (points[:, 2] <= 0.1)
     seen = there.inside((points @ turn.T + moved[:3, 3]).astype(np.float32))
     np.testing.assert_array_equal(seen[~edge], expected[~edge])
+
+
+def test_a_bin_whose_opening_does_not_face_the_camera_is_refused() -> None:
+    upside_down = transform(np.eye(3), [0, 0, 0.8])  # z points away from the camera
+    with pytest.raises(
+        InputError,
+        match=r"bin camera_from_bin must have the camera above the opening \(0.1 m over the floor, z up\), "
+        r"got it at -0.8 m: is the bin's frame upside down, or is this bin_from_camera\? turn it, or invert the matrix",
+    ):
+        Crop(upside_down, np.array([0.3, 0.2, 0.1]))
+    turned = transform(rotation_about([1, 0, 0], np.pi), [0, 0, 0.8])
+    Crop(turned, np.array([0.3, 0.2, 0.79]))
+    with pytest.raises(InputError, match=r"above the opening \(0.8001 m"):
+        Crop(turned, np.array([0.3, 0.2, 0.8001]))
 
 
 @pytest.mark.parametrize(

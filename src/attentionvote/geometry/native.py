@@ -121,8 +121,14 @@ def long(value: int) -> ctypes.c_int64:
 
 def cache_folder() -> Path:
     """Where things computed once per machine are kept: ``ATTENTIONVOTE_CACHE``, else the user's cache folder."""
-    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "attentionvote"
-    return Path(os.environ.get("ATTENTIONVOTE_CACHE", default))
+    if named := os.environ.get("ATTENTIONVOTE_CACHE"):
+        return Path(named)
+    if named := os.environ.get("XDG_CACHE_HOME"):
+        return Path(named) / "attentionvote"
+    try:
+        return Path.home() / ".cache" / "attentionvote"
+    except RuntimeError:  # a user without a home; libraries are loaded from nowhere that others may write to
+        return Path(f"/run/user/{os.getuid()}/attentionvote")
 
 
 def _processor() -> str:

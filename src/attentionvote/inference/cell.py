@@ -1,7 +1,7 @@
-"""The cell file: what is fixed about a cell, its camera and its bin, in one JSON file.
+"""The cell file: what is fixed about a cell, its camera, its bin and the unit of its clouds, in one JSON file.
 
 ``{"camera": {"fx": .., "fy": .., "cx": .., "cy": .., "depth_scale": 0.0001}, "bin": {"camera_from_bin": [[..], ..],
-"size": [0.36, 0.28, 0.16], "margin": 0.002}}``; both parts are optional.
+"size": [0.36, 0.28, 0.16], "margin": 0.002}, "cloud": {"unit": "mm"}}``; all parts are optional.
 """
 
 from __future__ import annotations
@@ -13,19 +13,67 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.preparation import Crop
 from attentionvote.inference.scans.depth_files import CameraIntrinsics
+from attentionvote.inference.scans.limits import BLOCK_ROWS
 
 _MOST_BYTES = 64 * 1024
 
 
+# Units in a metre: dividing by them is exact where multiplying by 0.001 is not.
+_UNITS_A_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "um": 1e6, "inch": 1 / 0.0254}
+
+
+@dataclass(frozen=True)
+class CloudUnit:
+    """The unit of clouds that are read from files; arrays over the protocol are metres always.
+
+    Args:
+        unit: m, cm, mm, um or inch.
+
+    Raises:
+        InputError: when it is another one.
+    """
+
+    unit: str = "m"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.unit, str) or self.unit not in _UNITS_A_METRE:
+            near = difflib.get_close_matches(str(self.unit).lower(), _UNITS_A_METRE, n=1, cutoff=0.0)[0]
+            raise InputError(
+                f"cloud unit must be one of {', '.join(_UNITS_A_METRE)}, got {str(self.unit)[:20]!r}, "
+                f"did you mean {near!r}?"
+            )
+
+    def metres(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Points ``(..., 3)`` of this unit in metres, each coordinate rounded once; metres are returned as they are."""
+        if self.unit == "m":
+            return points
+        scaled = np.empty(points.shape, np.float32)
+        rows, target = points.reshape(-1, 3), scaled.reshape(-1, 3)
+        for start in range(0, len(rows), BLOCK_ROWS):  # doubles of a whole frame would be twice its size
+            block = rows[start : start + BLOCK_ROWS].astype(np.float64)
+            target[start : start + BLOCK_ROWS] = block / _UNITS_A_METRE[self.unit]
+        return scaled
+
+
 @dataclass(frozen=True)
 class Cell:
-    """A cell's camera, for depth images, and bin, which is cropped to; None where the file says nothing."""
+    """What is fixed about a cell.
+
+    Attributes:
+        camera: of depth images; None where the file says nothing.
+        crop: the bin, which is cropped to; None where the file says nothing.
+        cloud: unit of clouds from files; metres where the file says nothing.
+    """
 
     camera: CameraIntrinsics | None = None
     crop: Crop | None = None
+    cloud: CloudUnit = CloudUnit()
 
 
 def read_cell(path: Path | str) -> Cell:
@@ -64,11 +112,14 @@ def parse_cell(content: bytes) -> Cell:
         InputError: with one sentence.
     """
     try:
-        described = json.loads(content)
+        described = json.loads(content, object_pairs_hook=_without_twins)
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"it must be JSON, got a text that is none ({error})") from error
-    _check_keys("the cell", described, ("camera", "bin"), ())
+    _check_keys("the cell", described, ("camera", "bin", "cloud"), ())
     camera = crop = None
+    cloud = CloudUnit()
     if "camera" in described:
         names = [f.name for f in fields(CameraIntrinsics)]
         needed = [f.name for f in fields(CameraIntrinsics) if f.default is MISSING]
@@ -77,7 +128,20 @@ def parse_cell(content: bytes) -> Cell:
     if "bin" in described:
         _check_keys("bin", described["bin"], ("camera_from_bin", "size", "margin"), ("camera_from_bin", "size"))
         crop = Crop(**described["bin"])
-    return Cell(camera, crop)
+    if "cloud" in described:
+        _check_keys("cloud", described["cloud"], ("unit",), ("unit",))
+        cloud = CloudUnit(**described["cloud"])
+    return Cell(camera, crop, cloud)
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object; of a key that stands twice Python's reader would take the last one, silently."""
+    described: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in described:
+            raise InputError(f"each key must stand once in its object, got {key[:60]!r} twice: remove one of them")
+        described[key] = value
+    return described
 
 
 def _check_keys(what: str, value: Any, known: Collection[str], needed: Collection[str]) -> None:

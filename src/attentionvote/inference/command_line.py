@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 BUNDLE_VARIABLE = "ATTENTIONVOTE_BUNDLE"
+# For one file: whoever types a command waits for it, and nobody else does.
+_MOST_READING_S = 60.0
 
 
 class _Parser(argparse.ArgumentParser):
@@ -159,6 +161,7 @@ def _estimate(options: argparse.Namespace) -> int:
     from attentionvote.inference.scans.cloud_files import read_cloud
     from attentionvote.inference.scans.depth_files import PNG_MAGIC, read_depth
     from attentionvote.inference.scans.file_bytes import file_bytes
+    from attentionvote.inference.scans.limits import Budget
 
     if not options.bundle:
         raise InputError(f"estimate needs a bundle, got none: give --bundle PATH or set {BUNDLE_VARIABLE}")
@@ -171,7 +174,7 @@ def _estimate(options: argparse.Namespace) -> int:
             raise InputError(f"{name} is a depth image and needs its camera: describe it in a cell file, --cell FILE")
         given: dict[str, Any] = {"depth": read_depth(content, name), "camera": cell.camera}
     else:
-        given = {"points": read_cloud(content, name)}
+        given = {"points": cell.cloud.metres(read_cloud(content, name, budget=Budget(most_seconds=_MOST_READING_S)))}
     with PoseEstimator(
         options.bundle, threads=options.threads, crop=cell.crop, camera=cell.camera, trusted=_trusted(options)
     ) as estimator:

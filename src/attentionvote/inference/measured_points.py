@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from attentionvote.contract import ModelCard
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scale_check import check_unit
+from attentionvote.inference.scans.limits import MOST_POINTS
 
-MOST_POINTS = 4_000_000
 # Beyond ten times the farthest scene lies no hall around a bin, only what a sensor invents or another unit.
 STRAY_FACTOR = 10.0
 _WARNED_SHARE, _REFUSED_SHARE = 0.001, 0.2

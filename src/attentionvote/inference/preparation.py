@@ -91,6 +91,13 @@ class Crop:
                 f"bin margin must be metres from 0 to less than half the bin's smallest side ({size.min() / 2:g}), "
                 f"got {self.margin}"
             )
+        camera_height = float(inverse(pose)[2, 3])
+        if camera_height <= size[2]:
+            raise InputError(
+                f"bin camera_from_bin must have the camera above the opening ({size[2]:g} m over the floor, z up), "
+                f"got it at {camera_height:.4g} m: is the bin's frame upside down, or is this bin_from_camera? "
+                "turn it, or invert the matrix"
+            )
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which of the points ``(P, 3)`` lie in the bin; the bin is open to above by its height."""

@@ -16,12 +16,17 @@ WARNED_FACTOR = 1.2
 # Beside the bin a camera may see a hall, some ten times as far away; inches for metres, the nearest
 # of the wrong units, are off by forty, of which the range of working distances hides less than a half.
 WRONG_UNIT_FACTOR = 20.0
+# A cloud in the world's frame is as large as a scene, but its height over the table is no distance from a camera, or it
+# lies where no camera that looks along z sees it: 75 degrees beside the axis.
+_LIKE_SIZE, _FLAT, _STEEPEST = 3.0, 6.0, 3.7
 _LOOKED_AT = 5_000  # points are enough for percentiles
 # What a cloud is multiplied by when it comes in another unit, and what to say.
 _UNITS = (
     (1000.0, "were millimetres sent? divide by 1000"),
     (100.0, "were centimetres sent? divide by 100"),
     (39.37, "were inches sent? multiply by 0.0254"),
+    (10.0, "is it ten times too far? divide it, or the depth_scale of a depth image, by 10"),
+    (0.1, "is it ten times too near? multiply it, or the depth_scale of a depth image, by 10"),
     (0.001, "were metres divided by 1000 once too often? multiply by 1000"),
     (0.0254, "were metres taken for inches? divide by 0.0254"),
 )
@@ -35,12 +40,14 @@ class _Scale(NamedTuple):
         depth: factor by which its median depth lies beyond the farthest (above 1) or before the nearest (below 1).
         extent: its largest side as a multiple of a scene's.
         question: what may have happened.
+        upright: whether it seems to be in a frame whose z points up: of the right size, but beside the camera's view.
     """
 
     said: str
     depth: float
     extent: float
     question: str
+    upright: bool
 
 
 def check_unit(cloud: NDArray[np.float32], card: ModelCard) -> None:
@@ -74,6 +81,12 @@ def check_scene(cloud: NDArray[np.float32], card: ModelCard) -> tuple[str, ...]:
 
 
 def _refuse_depth(scale: _Scale, factor: float) -> None:
+    if scale.upright:
+        raise InputError(
+            f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.said}: "
+            "the cloud seems to be in a robot's or the world's frame with z up, "
+            "transform it by the inverse of the camera's pose"
+        )
     if scale.depth <= 0:
         raise InputError(
             f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.said}: "
@@ -96,7 +109,10 @@ def _scale(cloud: NDArray[np.float32], card: ModelCard) -> _Scale:
         f"the model knows scenes {card.extent:.3g} m wide at {near:.3g}..{far:.3g} m"
     )
     depth = deep / far if deep > far else deep / near if deep < near else 1.0
-    return _Scale(said, depth, float((high - low).max()) / card.extent, _question(deep / math.sqrt(near * far)))
+    extent = float((high - low).max()) / card.extent
+    beside = math.hypot(middle[0], middle[1]) > _STEEPEST * abs(deep)
+    upright = 1 / _LIKE_SIZE < extent < _LIKE_SIZE and (abs(deep) < near / _FLAT or beside)
+    return _Scale(said, depth, extent, _question(deep / math.sqrt(near * far)), upright)
 
 
 def _question(factor: float) -> str:

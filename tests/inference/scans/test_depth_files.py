@@ -93,6 +93,28 @@ def test_arrays_of_another_shape_are_refused() -> None:
         read_depth(stream.getvalue())
 
 
+def test_an_array_of_too_many_pixels_or_of_records_is_refused() -> None:
+    stream = io.BytesIO()
+    np.save(stream, np.zeros((4000, 2001), np.uint8))
+    with pytest.raises(InputError, match="must have 1 to 8000000 pixels, got 2001 x 4000"):
+        read_depth(stream.getvalue())
+    stream = io.BytesIO()
+    np.save(stream, np.zeros((4, 5), [("z", "f4")]))
+    with pytest.raises(InputError, match=r"must be a depth image \(H, W\), got shape \(4, 5\) of \[\('z', '<f4'\)\]"):
+        read_depth(stream.getvalue())
+
+
+@pytest.mark.parametrize("kind", [bytearray, memoryview])
+def test_content_is_not_kept(kind: type) -> None:
+    stream = io.BytesIO()
+    np.save(stream, IMAGE)
+    for whole in (png(IMAGE), stream.getvalue()):
+        content = kind(whole)
+        np.testing.assert_array_equal(read_depth(content), IMAGE)
+        if isinstance(content, bytearray):
+            content.clear()  # fails while an array refers to it
+
+
 def test_paths_that_are_no_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must be a file, but there is none: check the path"):
         read_depth(tmp_path / "none.png")
@@ -111,6 +133,49 @@ def test_a_small_file_of_a_large_image_reserves_only_the_image() -> None:
         assert tracemalloc.get_traced_memory()[1] < 4 * MIB
     finally:
         tracemalloc.stop()
+
+
+def header(width: int, height: int, bits: int = 16, color: int = 0) -> bytes:
+    """The chunk IHDR."""
+    return chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0))
+
+
+@pytest.mark.parametrize("second", [header(9000, 9000), header(3000, 3000, 8, 6), header(17, 12)])
+def test_a_second_header_is_refused_before_anything_is_decoded(second: bytes) -> None:
+    whole = png(IMAGE)
+    tracemalloc.start()
+    try:
+        for at in (33, len(whole) - 12):
+            with pytest.raises(InputError, match=r"^the file must have one PNG header, got two: it is damaged$"):
+                read_depth(whole[:at] + second + whole[at:])
+        assert tracemalloc.get_traced_memory()[1] < MIB
+    finally:
+        tracemalloc.stop()
+
+
+def test_chunks_that_are_no_pixels_are_not_looked_at() -> None:
+    whole, bomb = png(IMAGE), zlib.compress(bytes(60 * MIB))
+    others = (
+        chunk(b"zTXt", b"a\0\0" + bomb)
+        + chunk(b"iCCP", b"a\0\0" + bomb)
+        + chunk(b"acTL", bytes(8))
+        + chunk(b"eXIf", bomb)
+    )
+    read_depth(whole)  # imports
+    tracemalloc.start()
+    try:
+        np.testing.assert_array_equal(read_depth(whole[:33] + others + whole[33:]), IMAGE)
+        assert tracemalloc.get_traced_memory()[1] < MIB
+    finally:
+        tracemalloc.stop()
+
+
+def test_more_chunks_than_any_writer_makes_are_refused() -> None:
+    whole = png(IMAGE)
+    with pytest.raises(InputError, match="must have at most 65536 chunks, got more: write it again"):
+        read_depth(whole[:33] + chunk(b"IDAT", b"") * 65_536 + whole[33:])
+    with pytest.raises(InputError, match="cannot be decoded: it is truncated or damaged"):
+        read_depth(whole[:33] + struct.pack(">I", 2**32 - 1) + b"tEXt" + whole[33:])
 
 
 @given(st.data())
@@ -143,6 +208,23 @@ def test_counts_become_metres_by_scale_and_offset() -> None:
     depth[:] = 65535
     depth[6, 8], depth[6, 9] = 0, 1000  # count 0 is a measurement here
     np.testing.assert_allclose(scaled.points(depth), [[0, 0, 0.5], [0.6 / 500, 0, 0.6]], atol=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "largest"), [(np.uint16, 65535), (np.uint8, 255), (np.int16, 32767)])
+def test_pixels_at_the_largest_count_are_missing_and_the_camera_must_say_so(dtype: type, largest: int) -> None:
+    depth = np.full((12, 17), 100, dtype)
+    depth[:, :4] = largest
+    message = (
+        f"depth must have counts of measurements only, beside the camera's missing 0, but 24% of the pixels have the "
+        f'largest count: are these the missing ones\\? write "missing": {largest} into the cell file'
+    )
+    with pytest.raises(InputError, match=message):
+        CAMERA.points(depth)
+    named = CameraIntrinsics(fx=500, fy=400, cx=8, cy=6, missing=largest)
+    assert len(named.points(depth)) == 12 * 13
+    depth[:, :4] = 100
+    depth[0, :4] = largest  # a few may be saturated
+    assert len(CAMERA.points(depth)) == 12 * 17
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16])

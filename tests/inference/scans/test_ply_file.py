@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scans.cloud_files import read_cloud
+from attentionvote.inference.scans.limits import Budget
 
 MIB = 1024 * 1024
 POINTS = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+pytestmark = pytest.mark.usefixtures("way")
 TEXT = {"f": "%.9g", "d": "%.17g", "B": "%d", "i": "%d"}
 
 
@@ -43,7 +45,7 @@ def ply(points: NDArray, order: str, fields: str = "xyz", newline: str = "\n", r
 
 
 @pytest.mark.parametrize("real", ["float", "double"])
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("fields", ["xyz", "nxryz", "zryx"])
 @pytest.mark.parametrize("order", PLY_ORDERS)
 def test_ply_in_every_order(order: str, fields: str, newline: str, real: str) -> None:
@@ -70,6 +72,48 @@ def test_ply_elements_before_the_vertices_are_skipped() -> None:
     assert read_cloud(header % b"binary_little_endian" + body).tolist() == [[0.5, 1, 2]]
 
 
+def test_names_of_axes_may_be_capitals() -> None:
+    content = BINARY.replace(b"float x", b"float X").replace(b"float y", b"float Y").replace(b"float z", b"float Z")
+    np.testing.assert_array_equal(read_cloud(content), POINTS)
+
+
+@pytest.mark.parametrize("order", PLY_ORDERS)
+def test_missing_points_keep_their_places(order: str) -> None:
+    points, expected = POINTS.copy(), POINTS.copy()
+    points[3], points[7], points[20] = (np.nan, np.nan, 1), (0.1, np.inf, 0.5), (0, -0.0, 0)
+    expected[[3, 7, 20]] = np.nan
+    np.testing.assert_array_equal(read_cloud(ply(points, order)), expected)
+
+
+@pytest.mark.parametrize("order", PLY_ORDERS)
+def test_more_than_the_header_promises_is_refused_where_nothing_may_follow(order: str) -> None:
+    with_face = ply(POINTS, order)
+    header, _, body = with_face.partition(b"element face 1\nproperty list uchar int vertex_indices\n")
+    alone = (header + body)[: -8 if order == "ascii" else -13]
+    np.testing.assert_array_equal(read_cloud(alone), POINTS)
+    np.testing.assert_array_equal(read_cloud(alone + b"\n\n" + bytes(100)), POINTS)
+    for more in (b"1 2 3\n", POINTS[:1].tobytes()):
+        with pytest.raises(InputError, match="promises 50 vertices and nothing else, but more follows them"):
+            read_cloud(alone + more)
+
+
+def test_points_of_a_file_that_promises_none_are_refused() -> None:
+    header = (
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    assert read_cloud(header + b"\n").shape == (0, 3)
+    with pytest.raises(InputError, match="promises 0 vertices and nothing else, but more follows them"):
+        read_cloud(header + b"1 2 3\n")
+
+
+def test_lists_before_the_vertices_are_skipped_in_a_text_only() -> None:
+    header = b"ply\nformat %s 1.0\nelement strip 2\nproperty list uchar int a\n"
+    header += b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    assert read_cloud(header % b"ascii" + b"2 1 2\n0\n0.5 1 2\n").tolist() == [[0.5, 1, 2]]
+    with pytest.raises(InputError, match="its element strip must have no list property unless it follows the vertices"):
+        read_cloud(header % b"binary_little_endian" + bytes(40))
+
+
 @pytest.mark.parametrize("order", PLY_ORDERS)
 def test_an_empty_cloud_is_a_cloud(order: str) -> None:
     assert read_cloud(ply(POINTS[:0], order)).shape == (0, 3)
@@ -89,7 +133,8 @@ ASCII, BINARY = ply(POINTS, "ascii"), ply(POINTS, "binary_little_endian")
         (BINARY.replace(b"float z", b"float y"), "its element vertex has the property 'y' twice"),
         (BINARY.replace(b"float z", b"list uchar int z"), "must have no list property"),
         (ASCII.replace(b"float z", b"list uchar int z"), "must have no list property"),
-        (BINARY.replace(b"vertex 50", b"vertex 5000000"), "at most 4000000 vertices, got 5000000"),
+        (BINARY.replace(b"vertex 50", b"vertex 5000000"), "promises 5000000 vertices of 12 bytes, but only"),
+        (BINARY.replace(b"property float z", b"property float z\nproperty float Z"), "must have z once, got z and Z"),
         (BINARY.replace(b"vertex 50", b"vertex -5"), "has the line 'element vertex -5'"),
         (BINARY.replace(b"vertex 50", b"vertex " + b"9" * 30), "has the line 'element vertex 999"),
         (BINARY.replace(b"vertex 50", b"vertex 52"), "promises 52 vertices of 12 bytes, but only 613 bytes follow"),
@@ -136,9 +181,14 @@ def test_long_texts_are_read_in_blocks(rows: int) -> None:
     stream = io.BytesIO()
     np.savetxt(stream, points, fmt="%d")
     header = ply(points[:0], "ascii").decode().replace("vertex 0", f"vertex {rows}").split("3 0 1 2")[0]
-    np.testing.assert_array_equal(read_cloud(header.encode() + stream.getvalue()), points)
+    np.testing.assert_array_equal(
+        read_cloud(header.encode() + stream.getvalue(), budget=Budget(most_seconds=60)), points
+    )
     with pytest.raises(InputError, match=f"promises {rows} points, but only {rows - 1} follow"):
-        read_cloud(header.encode() + stream.getvalue().rstrip().rsplit(b"\n", 1)[0] + b"\n" * 10)
+        read_cloud(
+            header.encode() + stream.getvalue().rstrip().rsplit(b"\n", 1)[0] + b"\n" * 10,
+            budget=Budget(most_seconds=60),
+        )
 
 
 Damage = Callable[[bytes, st.DataObject], bytes]

@@ -7,6 +7,7 @@ clouds) in memory: what was verified is what is run, whatever happens to the fol
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +37,7 @@ from attentionvote.inference.bundles.manifest import (
 from attentionvote.inference.bundles.signature import load_public_key, verify
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.scans.array_bytes import arrays_from_npz
+from attentionvote.inference.scans.limits import Budget
 
 __all__ = ["Bundle", "BundleError", "GoldenCloud", "Trusted", "load_bundle", "write_manifest"]
 
@@ -157,7 +159,7 @@ def _card(folder: Path, content: bytes, model: bytes) -> ModelCard:
 
 def _golden(name: str, content: bytes) -> GoldenCloud:
     try:
-        arrays = arrays_from_npz(content, _MOST_GOLDEN_BYTES)
+        arrays = arrays_from_npz(content, Budget(_MOST_GOLDEN_BYTES, math.inf))
         cloud = GoldenCloud(
             name.removeprefix(f"{GOLDEN}/").removesuffix(".npz"),
             arrays["points"],

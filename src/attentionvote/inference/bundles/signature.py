@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from attentionvote.inference.errors import BundleError
+from attentionvote.inference.home_folder import home_folder
 
 PRIVATE_NAME, PUBLIC_NAME = "signing.key", "signing.pub"
 KEYS_VARIABLE = "ATTENTIONVOTE_KEYS"
@@ -29,9 +30,12 @@ _MOST_BYTES = 16 * 1024  # of a key or signature file; real ones have a few hund
 
 
 def keys_folder() -> Path:
-    """Where the keys lie: the folder that ``ATTENTIONVOTE_KEYS`` names, else ``~/.config/attentionvote``."""
-    named = os.environ.get(KEYS_VARIABLE)
-    return Path(named).expanduser() if named else Path.home() / ".config" / "attentionvote"
+    """Where the keys lie: the folder that ``ATTENTIONVOTE_KEYS`` names, else ``~/.config/attentionvote``.
+
+    Raises:
+        InputError: when there is neither.
+    """
+    return home_folder(KEYS_VARIABLE, ".config", "--key")
 
 
 def make_keys(folder: Path) -> tuple[Path, Path]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import math
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +13,17 @@ from numpy.typing import NDArray
 from attentionvote.geometry.pointcloud import back_project
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scans.array_bytes import NPY_MAGIC, array_from_npy
-from attentionvote.inference.scans.file_bytes import file_bytes
+from attentionvote.inference.scans.camera_figures import check_depth_coding, check_focal_lengths, check_principal_point
+from attentionvote.inference.scans.file_bytes import Content, content_view
+from attentionvote.inference.scans.limits import MOST_PIXELS, Budget
+from attentionvote.inference.scans.other_kinds import other_kind
+from attentionvote.inference.scans.png_depth import PNG_MAGIC, depth_from_png
+from attentionvote.inference.scans.sentences import one_line
 
-MOST_PIXELS = 8_000_000
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+__all__ = ["PNG_MAGIC", "CameraIntrinsics", "read_depth"]
+
+# Of an image's pixels: fewer at the largest count may be saturated ones.
+_MISSING_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -56,14 +61,15 @@ class CameraIntrinsics:
         for name in ("fx", "fy", "depth_scale"):
             if not getattr(self, name) > 0:
                 raise InputError(f"camera {name} must be positive, got {getattr(self, name)}")
-        if self.depth_offset < 0:
-            raise InputError(f"camera depth_offset must be at least 0 metres, got {self.depth_offset}")
         for name, least in (("missing", 0), ("width", 1), ("height", 1)):
             value = getattr(self, name)
             if value is None and name != "missing":
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**32:
                 raise InputError(f"camera {name} must be a whole number of at least {least}, got {value!r}")
+        check_focal_lengths(self.fx, self.fy, self.width, self.height)
+        check_principal_point(self.cx, self.cy, self.width, self.height)
+        check_depth_coding(self.depth_scale, self.depth_offset)
 
     def points(self, depth: NDArray[Any]) -> NDArray[np.float32]:
         """Measured points ``(P, 3)`` metres, camera frame, of a depth image ``(H, W)``.
@@ -82,6 +88,7 @@ class CameraIntrinsics:
         if depth.dtype.kind == "f":
             metres = depth
         else:
+            self._check_missing(depth)
             metres = self.depth_offset + self.depth_scale * depth.astype(np.float64)
             metres[depth == self.missing] = np.nan
         try:
@@ -89,54 +96,50 @@ class CameraIntrinsics:
         except ValueError as error:
             raise InputError(str(error)) from error
 
+    def _check_missing(self, depth: NDArray[np.integer]) -> None:
+        """Refuse an image whose missing pixels have another count than the camera says."""
+        largest = int(np.iinfo(depth.dtype).max)
+        share = np.count_nonzero(depth == largest) / max(depth.size, 1)
+        if self.missing != largest and share > _MISSING_SHARE:
+            raise InputError(
+                f"depth must have counts of measurements only, beside the camera's missing {self.missing}, "
+                f"but {share:.0%} of the pixels have the largest count: are these the missing ones? "
+                f'write "missing": {largest} into the cell file'
+            )
 
-def read_depth(source: Path | str | bytes, name: str = "") -> NDArray[Any]:
-    """A depth image ``(H, W)``: uint16 counts of a PNG, or what a .npy file holds.
+
+def read_depth(source: Path | str | Content, name: str = "", *, budget: Budget | None = None) -> NDArray[Any]:
+    """A depth image ``(H, W)``: uint16 counts of a PNG, or what a .npy file holds. The array is new.
 
     Args:
-        source: path, or the file's content.
+        source: path, or the file's content, which is not copied.
         name: for messages when the content is given.
+        budget: what reading may cost; None: the usual one.
 
     Raises:
-        InputError: with one sentence, when it is no depth image, damaged or too large.
+        InputError: with one sentence, when it is no depth image, damaged, too large or too slow to read.
     """
-    content, name = file_bytes(source, name)
-    if content.startswith(PNG_MAGIC):
-        return _png(content, name)
-    if content.startswith(NPY_MAGIC):
-        try:
-            image = array_from_npy(content, 8 * MOST_PIXELS)
-        except ValueError as error:
-            raise InputError(f"{name} must be a depth image (H, W), but {error}") from error
-        if image.ndim != 2:
-            raise InputError(f"{name} must be a depth image (H, W), got shape {image.shape}")
-        return image
-    raise InputError(f"{name} must be a 16-bit PNG or a .npy file with a depth image, got another kind of file")
-
-
-def _png(content: bytes, name: str) -> NDArray[np.uint16]:
-    # The header is read first: nothing is decoded before its size and kind are known to be right.
-    if len(content) < 33 or content[12:16] != b"IHDR":
-        raise InputError(f"{name} must be a PNG file, but its header is damaged")
-    width, height, bits, color = struct.unpack(">IIBB", content[16:26])
-    if (bits, color) != (16, 0):
-        kinds = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
-        raise InputError(
-            f"{name} must be a 16-bit grey PNG, got {bits}-bit {kinds.get(color, 'unknown')}: "
-            "send the depth, not a picture of it"
-        )
-    if width < 1 or height < 1 or width * height > MOST_PIXELS:
-        raise InputError(f"{name} must have 1 to {MOST_PIXELS} pixels, got {width} x {height}")
-    from PIL import Image
-
+    content, name = content_view(source, name)
+    budget = budget or Budget()
     try:
-        with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
-            image.load()
-            pixels = np.asarray(image)
-    except Exception as error:  # Pillow's decoders let many kinds of exceptions through
-        raise InputError(
-            f"{name} must be a whole PNG file, but it cannot be decoded: it is truncated or damaged"
-        ) from error
-    if pixels.shape != (height, width):
-        raise InputError(f"{name} must be a depth image of {width} x {height}, but it decodes to shape {pixels.shape}")
-    return pixels.astype(np.uint16)
+        if bytes(content[:8]) == PNG_MAGIC:
+            return depth_from_png(content, name, budget)
+        if content[:6] == NPY_MAGIC:
+            return _from_npy(content, name, budget)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(one_line(f"{name} must be a depth image (H, W), but {error}")) from error
+    kind = other_kind(content, name) or "another kind of file"
+    raise InputError(f"{name} must be a 16-bit PNG or a .npy file with a depth image, got {kind}")
+
+
+def _from_npy(content: memoryview, name: str, budget: Budget) -> NDArray[Any]:
+    image = array_from_npy(content)
+    if image.ndim != 2 or image.dtype.names is not None:
+        fields = f" of {image.dtype}" if image.dtype.names is not None else ""
+        raise InputError(one_line(f"{name} must be a depth image (H, W), got shape {image.shape}{fields}"))
+    if image.size > MOST_PIXELS:
+        raise InputError(f"{name} must have 1 to {MOST_PIXELS} pixels, got {image.shape[1]} x {image.shape[0]}")
+    budget.take(image.nbytes)
+    return image.copy()

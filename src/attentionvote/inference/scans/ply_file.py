@@ -8,11 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.inference.scans.number_rows import number_rows
+from attentionvote.inference.scans.limits import Budget
+from attentionvote.inference.scans.missing_points import cloud_of, mark_missing
+from attentionvote.inference.scans.number_rows import RowLayout, anything_behind, number_rows
 
-MAGIC = (b"ply\n", b"ply\r\n", b"ply ")
+MAGIC = (b"ply\n", b"ply\r", b"ply ")
 _MOST_HEADER_BYTES, _MOST_LINES = 256 * 1024, 2000
 _END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
+_END_CR = re.compile(rb"(?<=\r)end_header[ \t]*\r")
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -30,43 +33,81 @@ class _Element:
     properties: dict[str, str | None] = field(default_factory=dict)
 
 
-def points_from_ply(content: bytes, most_points: int) -> NDArray[np.float32]:
-    """Coordinates ``(P, 3)`` of the vertices.
+def points_from_ply(content: memoryview, budget: Budget) -> NDArray[np.float32]:
+    """Coordinates ``(P, 3)`` of the vertices, missing ones NaN.
 
     Raises:
-        ValueError: with what is wrong, when the file is no PLY file, damaged or too large.
+        ValueError: with what is wrong, when the file is no PLY file, damaged, or costs more than the budget.
     """
     order, elements, start = _header(content)
     vertex = next((element for element in elements if element.name == "vertex"), None)
     if vertex is None:
         raise ValueError("its header has no element vertex")
-    if missing := [axis for axis in "xyz" if axis not in vertex.properties]:
-        raise ValueError(f"its vertices must have x, y and z, got no {missing[0]}")
-    if vertex.count > most_points:
-        raise ValueError(f"it must have at most {most_points} vertices, got {vertex.count}")
-    if not vertex.count:
-        return np.zeros((0, 3), np.float32)
-    before = elements[: elements.index(vertex)]
-    if _FORMATS[order]:
-        for element in before:
-            start += element.count * _row(element, order).itemsize
-        row = _row(vertex, order)
-        there = max(len(content) - start, 0)
-        if vertex.count * row.itemsize > there:
-            raise ValueError(
-                f"its header promises {vertex.count} vertices of {row.itemsize} bytes, "
-                f"but only {there} bytes follow: it is truncated"
-            )
-        rows = np.frombuffer(content, row, vertex.count, start)
-        columns = [rows[axis] for axis in "xyz"]
-    else:
-        if None in vertex.properties.values():
-            raise ValueError("its vertices must have no list property")
-        places = [list(vertex.properties).index(axis) for axis in "xyz"]
-        skip = sum(element.count for element in before)
-        columns = list(number_rows(content[start:], skip, vertex.count, len(vertex.properties), places).T)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.stack([column.astype(np.float32) for column in columns], axis=-1)
+    axes = _axes(vertex)
+    before, behind = elements[: elements.index(vertex)], elements[elements.index(vertex) + 1 :]
+    cloud, end = np.zeros((0, 3), np.float32), start
+    if vertex.count:
+        read = _from_rows if _FORMATS[order] else _from_text
+        cloud, end = read(content, start, order, before, vertex, axes, budget)
+    alone = not any(element.count for element in behind) and (vertex.count or not any(e.count for e in before))
+    if alone and anything_behind(content, end, budget):
+        raise ValueError(f"its header promises {vertex.count} vertices and nothing else, but more follows them")
+    return cloud
+
+
+def _axes(vertex: _Element) -> list[str]:
+    """The names of x, y and z, which some write in capitals."""
+    axes = []
+    for axis in "xyz":
+        names = [name for name in vertex.properties if name.lower() == axis]
+        if not names:
+            raise ValueError(f"its vertices must have x, y and z, got no {axis}")
+        if len(names) > 1:
+            raise ValueError(f"its vertices must have {axis} once, got {' and '.join(names)}")
+        axes += names
+    return axes
+
+
+def _from_rows(
+    content: memoryview,
+    start: int,
+    order: str,
+    before: list[_Element],
+    vertex: _Element,
+    axes: list[str],
+    budget: Budget,
+) -> tuple[NDArray[np.float32], int]:
+    """The cloud and where the file goes on behind it."""
+    for element in before:
+        start += element.count * _row(element, order).itemsize
+    row = _row(vertex, order)
+    there = max(len(content) - start, 0)
+    if vertex.count * row.itemsize > there:
+        raise ValueError(
+            f"its header promises {vertex.count} vertices of {row.itemsize} bytes, "
+            f"but only {there} bytes follow: it is truncated"
+        )
+    rows = np.frombuffer(content, row, vertex.count, start)
+    return cloud_of([rows[axis] for axis in axes], budget), start + vertex.count * row.itemsize
+
+
+def _from_text(
+    content: memoryview,
+    start: int,
+    _: str,
+    before: list[_Element],
+    vertex: _Element,
+    axes: list[str],
+    budget: Budget,
+) -> tuple[NDArray[np.float32], int]:
+    """The cloud and where the file goes on behind it."""
+    if None in vertex.properties.values():
+        raise ValueError("its vertices must have no list property")
+    layout = RowLayout(len(vertex.properties), [list(vertex.properties).index(axis) for axis in axes])
+    skip = sum(element.count for element in before)
+    cloud, end = number_rows(content[start:], skip, vertex.count, layout, budget)
+    mark_missing(cloud)
+    return cloud, start + end
 
 
 def _row(element: _Element, order: str) -> np.dtype:
@@ -77,12 +118,14 @@ def _row(element: _Element, order: str) -> np.dtype:
     return np.dtype(kinds)
 
 
-def _header(content: bytes) -> tuple[str, list[_Element], int]:
+def _header(content: memoryview) -> tuple[str, list[_Element], int]:
     """Format, elements, and where the data begin."""
-    end = _END.search(content[:_MOST_HEADER_BYTES])
+    head = bytes(content[:_MOST_HEADER_BYTES])
+    # A file whose lines end with CR alone is told by its first line: the first byte of its data may be an LF.
+    end = (_END_CR if re.match(rb"ply[ \t]*\r(?!\n)", head) else _END).search(head)
     if end is None:
         raise ValueError("its header has no end_header")
-    lines = content[: end.start()].decode("latin-1").splitlines()
+    lines = head[: end.start()].decode("latin-1").splitlines()
     if len(lines) > _MOST_LINES:
         raise ValueError(f"its header must have at most {_MOST_LINES} lines, got {len(lines)}")
     order = ""

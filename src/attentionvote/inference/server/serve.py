@@ -24,6 +24,7 @@ from attentionvote.inference.cell import cell_bytes
 from attentionvote.inference.errors import BundleError, InputError
 from attentionvote.inference.fetching import access as registry_access
 from attentionvote.inference.fetching.bundles import FetchedBundles
+from attentionvote.inference.scans.limits import MOST_POINTS
 from attentionvote.inference.server.access import Tokens, check_host
 from attentionvote.inference.server.admission import Gate
 from attentionvote.inference.server.answering import Answering, Limits
@@ -66,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--queue", type=int, default=2, help="requests that may wait beside the running one, default 2")
     add("--deadline-ms", type=float, default=2000.0, help="of requests that name none, default 2000")
     add("--max-deadline-ms", type=float, help="longest that a request may name, default 10000 or --deadline-ms")
+    add("--max-points", type=int, default=MOST_POINTS, help=f"measured points of a scan, default {MOST_POINTS}")
     add("--job-memory-mb", type=float, default=768.0, help="memory of one request's work in MiB, default 768")
     add("--self-test-s", type=float, default=60.0, help="seconds for loading and testing a bundle, default 60")
     add("--max-body-mb", type=float, default=64.0, help="largest request body in MiB, default 64")
@@ -126,6 +128,7 @@ def _checked(options: argparse.Namespace) -> _Settings:
         options.max_deadline_ms = max(_MAX_DEADLINE_MS, options.deadline_ms)
     _check_range("--max-deadline-ms", options.max_deadline_ms, 1, 3_600_000)
     _check_range("--deadline-ms", options.deadline_ms, 1, options.max_deadline_ms)
+    _check_range("--max-points", options.max_points, 1000, 100_000_000)
     _check_range("--job-memory-mb", options.job_memory_mb, 64, 65_536)
     _check_range("--self-test-s", options.self_test_s, 1, 3600)
     _check_range("--max-body-mb", options.max_body_mb, 0.001, 1024)
@@ -158,7 +161,7 @@ def _checked(options: argparse.Namespace) -> _Settings:
 
     metrics = Metrics()
     memory = int(options.job_memory_mb * _MEBIBYTE)
-    workers = WorkerSettings(options.threads, cell, memory, options.self_test_s)
+    workers = WorkerSettings(options.threads, cell, options.max_points, memory, options.self_test_s)
 
     def start_workers(bundle: Bundle, polite: bool) -> Workers:
         return Workers(bundle, workers, polite=polite, lost=lambda reason: metrics.workers_lost.labels(reason).inc())

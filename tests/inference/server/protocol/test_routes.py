@@ -103,6 +103,7 @@ def test_tritons_client_shows_the_servers_sentence(shared_server: Any, make_clou
         for points, sentence in (
             (cloud * 1000, "points must be metres: .* were millimetres sent"),
             (np.full((100, 3), 2e38, np.float32), r"points must be metres: the cloud is 0 wide and 2e\+38 deep"),
+            (cloud * np.float32([1, -1, -1]), "points must lie before the camera, in its frame"),
         ):
             with pytest.raises(triton.InferenceServerException, match=sentence) as caught:
                 client.infer("bracket", [cloud_input(points, True)])

@@ -39,8 +39,8 @@ def losses() -> list[str]:
 
 @pytest.fixture
 def workers(bundle: Bundle, losses: list[str]) -> Iterator[Workers]:
-    """A pair, both loaded; a job may take 64 MiB."""
-    settings = WorkerSettings(job_memory_bytes=64 * 1024 * 1024)
+    """A pair, both loaded; a job may take 24 MiB."""
+    settings = WorkerSettings(job_memory_bytes=24 * 1024 * 1024)
     made = Workers(bundle, settings, lost=losses.append)
     wait_for(lambda: made._spare is not None)
     yield made

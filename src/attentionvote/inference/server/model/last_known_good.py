@@ -23,6 +23,7 @@ from attentionvote.inference.bundles.manifest import MANIFEST, SIGNATURE, files_
 from attentionvote.inference.durable import sync
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.fetching.reference import SCHEME, Reference
+from attentionvote.inference.home_folder import home_folder
 
 STATE_VARIABLE = "ATTENTIONVOTE_STATE"
 KEPT = 2
@@ -34,9 +35,11 @@ def default_state(source: Path | Reference) -> Path:
 
     Without the variable they lie below ``~/.local/state/attentionvote``. The name follows the path as it was given,
     links unresolved, because that is what stays the same when the bundle behind it changes.
+
+    Raises:
+        InputError: when there is neither the variable nor a home.
     """
-    named = os.environ.get(STATE_VARIABLE)
-    root = Path(named).expanduser() if named else Path.home() / ".local" / "state" / "attentionvote"
+    root = home_folder(STATE_VARIABLE, ".local/state", "--state")
     if isinstance(source, Reference):  # wherever the server is started from
         absolute = str(source)
         name = absolute.removeprefix(SCHEME)

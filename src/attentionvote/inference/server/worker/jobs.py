@@ -109,9 +109,9 @@ class _Job:
                 self._deadline.budget_s = deadline_seconds("parameter deadline_ms", asked.deadline_ms, most)
                 self._channel.send({"budget_s": self._deadline.budget_s})
             return asked, {"points": asked.points}
-        body = bytes(self._body)
-        if not body.startswith(PNG_MAGIC):
-            return None, {"points": read_cloud(body, "the body")}
+        body = self._body
+        if bytes(body[: len(PNG_MAGIC)]) != PNG_MAGIC:
+            return None, {"points": self._cell.cloud.metres(read_cloud(body, "the body"))}
         if self._cell.camera is None:
             raise InputError(
                 "a depth image needs its camera, got none: start the server with --cell and a camera in it"

@@ -102,7 +102,8 @@ def _load(message: Message) -> tuple[Jobs | None, str | None]:
     bundle = Bundle(Path(), card, head["digest"], model, dict(zip(head["golden"], golden, strict=True)))
     cell = parse_cell(cell_text) if cell_text else Cell()
     try:
-        estimator = PoseEstimator(bundle, threads=head["threads"], crop=cell.crop, camera=cell.camera)
+        limits = {"threads": head["threads"], "most_points": head["most_points"]}
+        estimator = PoseEstimator(bundle, crop=cell.crop, camera=cell.camera, **limits)
     except BundleError as error:
         return None, str(error)
     problems = self_test(estimator, bundle) if head["self_test"] else []

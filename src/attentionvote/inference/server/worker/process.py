@@ -17,6 +17,7 @@ from typing import Any, Literal
 from attentionvote.inference.bundles.bundle import Bundle
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.fetching.access import PASSWORD_VARIABLE, USER_VARIABLE
+from attentionvote.inference.scans.limits import MOST_POINTS
 from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.worker.channel import Channel, ChannelClosed, Message, SharedContent
 
@@ -51,12 +52,14 @@ class WorkerSettings:
     Attributes:
         threads: of an estimate.
         cell: content of the cell file; empty without.
+        most_points: that a scan may have measured.
         job_memory_bytes: what a job may take beside the loaded model.
         load_s: seconds for loading and testing a bundle.
     """
 
     threads: int = 1
     cell: bytes = b""
+    most_points: int = MOST_POINTS
     job_memory_bytes: int = 768 * 1024 * 1024
     load_s: float = 60.0
 
@@ -215,6 +218,7 @@ class WorkerProcess:
             "golden": list(bundle.golden_files),
             "digest": bundle.digest,
             "threads": settings.threads,
+            "most_points": settings.most_points,
             "job_memory_bytes": settings.job_memory_bytes,
             "self_test": self_test,
             "polite": polite,
