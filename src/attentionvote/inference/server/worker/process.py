@@ -24,6 +24,7 @@ from attentionvote.inference.server.worker.channel import Channel, ChannelClosed
 # A job stops itself at its deadline; one that runs this much longer has lost control of itself.
 OVERRUN_S = 1.0
 _LAST_WORDS = 2000
+_OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "OpenBLAS error: Memory allocation")
 Loss = Literal["deadline", "memory", "crashed"]
 
 
@@ -245,7 +246,7 @@ class WorkerProcess:
         code = self._process.poll()
         words = self._last_words()
         self._process.kill()
-        if code == -signal.SIGKILL or "bad_alloc" in words or "MemoryError" in words:
+        if code == -signal.SIGKILL or any(sign in words for sign in _OUT_OF_MEMORY):
             return WorkerLost("memory", f"the worker took more memory than there is ({_ended(code)})")
         return WorkerLost("crashed", f"the worker {_ended(code)}{': ' if words else ''}{words}")
 
