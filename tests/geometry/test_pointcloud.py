@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -180,3 +181,17 @@ def test_sampling_repeats_only_when_it_must(available: int, count: int, seed: in
 def test_nothing_can_be_sampled_from_an_empty_cloud() -> None:
     with pytest.raises(ValueError, match="cannot sample from an empty cloud"):
         sample_indices(0, 3, np.random.default_rng(0))
+
+
+def test_places_that_are_repeated_take_no_longer() -> None:
+    """A sensor or a file that writes a few places many times over must not keep a cell busy for seconds."""
+    rng = np.random.default_rng(4)
+    places = rng.normal(size=(20, 3)).astype(np.float32) * np.float32(0.1) + np.float32([0, 0, 1])
+    cloud = places[np.r_[np.zeros(20_000, int), rng.integers(0, 20, 2000)]]
+    begun = time.process_time()
+    normals = estimate_normals(cloud, cloud, 30)
+    assert time.process_time() - begun < 0.5  # every query by itself takes some seconds
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    few = np.repeat(places, 4, axis=0)
+    expected = estimate_normals_reference(few, few, 30)
+    np.testing.assert_allclose(np.abs((estimate_normals(few, few, 30) * expected).sum(axis=1)), 1, atol=1e-5)

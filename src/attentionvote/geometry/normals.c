@@ -11,6 +11,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+#include <string.h>
 
 #define LEAF 16
 #define LANES 8          /* eigenvectors at a time */
@@ -274,16 +275,19 @@ int normals(const float *xyz, const int32_t *order, int32_t n, const float *quer
     float guess = side * side + SMALLEST;
     for (int32_t s = 0, end = 0; s < m; s++) {
         const float *p = queries + 3 * (int64_t)turn[s];
-        if (s == end) {
-            group.queries = (box){{p[0], p[1], p[2]}, {p[0], p[1], p[2]}};
-            for (end++; end < m && end < s + GROUP; end++)
-                if (!join(&group.queries, queries + 3 * (int64_t)turn[end], guess * SPREAD)) break;
-            if ((group.reach = guess * REACH) < LARGEST) collect(&t, &group);
+        /* Where the last query lay, its neighbours are this one's: a cloud that repeats a place takes no longer. */
+        if (!s || memcmp(p, queries + 3 * (int64_t)turn[s - 1], 3 * sizeof *p)) {
+            if (s >= end) {
+                group.queries = (box){{p[0], p[1], p[2]}, {p[0], p[1], p[2]}};
+                for (end = s + 1; end < m && end < s + GROUP; end++)
+                    if (!join(&group.queries, queries + 3 * (int64_t)turn[end], guess * SPREAD)) break;
+                if ((group.reach = guess * REACH) < LARGEST) collect(&t, &group);
+            }
+            alone.reach = group.reach;
+            if (group.reach >= LARGEST || !nearest(&t, p, k, &group, &guess, &near))
+                nearest_alone(&t, p, k, &alone, &guess, &near);
+            guess *= MARGIN;
         }
-        alone.reach = group.reach;
-        if (group.reach >= LARGEST || !nearest(&t, p, k, &group, &guess, &near))
-            nearest_alone(&t, p, k, &alone, &guess, &near);
-        guess *= MARGIN;
         const int32_t lane = s % LANES;
         moments(&t, near.place, k, c, lane);
         if (lane < LANES - 1 && s < m - 1) continue;
