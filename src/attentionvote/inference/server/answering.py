@@ -94,6 +94,7 @@ class Answering:
             content = await read_body(request, limits.most_body_bytes, deadline)
             self._took(record, "receive", deadline.elapsed_s())
             served = self.serving.model(name, version)
+            served.workers.hold()
             work = _Work(served, {**job, "most_deadline_ms": limits.most_deadline_ms}, content, deadline, record)
             future = self.serving.submit(work.run)
         except BaseException:
@@ -101,7 +102,7 @@ class Answering:
             if content is not None:
                 content.close()
             raise
-        _leave_when_done(place, content, future)
+        _leave_when_done(place, content, served, future)
         answer = await self._wait(request, future, deadline)
         for stage in ("queue", "parse", "estimate"):
             if stage in record.seconds:
@@ -148,7 +149,7 @@ class Answering:
 
 
 class _Work:
-    """The part of a request that the thread which asks workers waits for."""
+    """The part of a request that a thread which asks workers waits for."""
 
     def __init__(
         self, served: Served, job: dict[str, Any], content: SharedContent, deadline: Deadline, record: Record
@@ -160,7 +161,6 @@ class _Work:
     def run(self) -> Message:
         """Let a worker do it; a Refusal reaches the client."""
         seconds = self._record.seconds
-        seconds["queue"] = time.monotonic() - self._queued
         if self._deadline.remaining_s() <= 0:
             raise too_late(self._deadline, "the request waited in the queue")
         try:
@@ -169,7 +169,9 @@ class _Work:
             raise _lost(loss, self._deadline) from None
         if answer is None:
             raise too_late(self._deadline, "a lost worker was replaced")
-        seconds |= answer.head["seconds"]
+        worked: dict[str, float] = answer.head["seconds"]
+        seconds["queue"] = time.monotonic() - self._queued - sum(worked.values())
+        seconds |= worked
         return answer
 
 
@@ -192,12 +194,13 @@ async def _disconnected(request: Request) -> None:
         pass
 
 
-def _leave_when_done(place: Place, content: SharedContent, future: Future[Message]) -> None:
-    """Free place and body when the work has ended, in whichever thread that is."""
+def _leave_when_done(place: Place, content: SharedContent, served: Served, future: Future[Message]) -> None:
+    """Free place, body and workers when the work has ended, in whichever thread that is."""
     loop = asyncio.get_running_loop()
 
     def leave(_: Future[Message]) -> None:
         content.close()
+        served.workers.release()
         with suppress(RuntimeError):  # the loop has ended: the server is gone
             loop.call_soon_threadsafe(place.leave)
 

@@ -49,13 +49,17 @@ def test_the_old_one_is_closed_after_its_last_request(
         assert go_on.wait(20)
         return estimate(old, body)
 
-    running, waiting = serving.submit(slow), serving.submit(estimate, old, body)
+    for _ in range(2):
+        old.hold()
+    running, waiting = serving.submit(slow), serving.submit(slow)
     serving.swap(Served(new, kept=True, last_known_good=False))
     assert serving.model().workers is new
     go_on.set()
     assert len(running.result(20)["poses"]) == 2
+    old.release()
     assert waiting.result(20)["model"] == old.digest[:12]
-    serving.submit(int).result(20)  # everything before it has been done
+    assert old.available
+    old.release()
     assert not old.available
     with pytest.raises(RuntimeError, match="closed"):
         estimate(old, body)

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,52 @@ def test_a_stuck_worker_without_a_spare_is_not_available(workers: Workers, make_
     workers._spare = spare
     asking.join()
     assert workers.available
+
+
+def test_a_job_that_hangs_keeps_the_next_ones_waiting_for_a_second(workers: Workers, make_cloud: Any, npy: Any) -> None:
+    os.kill(pid_of(workers._active), signal.SIGSTOP)
+    with ThreadPoolExecutor(1) as pool:
+        hanging = pool.submit(ask, workers, npy(make_cloud()), 8.0)
+        wait_for(lambda: bool(workers._since))
+        begun = time.monotonic()
+        for _ in range(3):
+            answer = ask(workers, npy(make_cloud()))
+            assert answer is not None
+            assert answer.head["status"] == 200
+        assert 0.8 < time.monotonic() - begun < 3.0  # the first one waits for a second, the others for nobody
+        assert not hanging.done()
+        os.kill(pid_of(workers._active), signal.SIGCONT)
+        assert hanging.result(PATIENCE_S) is not None
+
+
+def test_jobs_are_done_one_by_one_in_their_order(
+    make_bundle: Make, trusted_key: Path, make_cloud: Any, npy: Any
+) -> None:
+    slow = Workers(load_bundle(make_bundle(graph={"loops": 100_000}), trusted_key), WorkerSettings())
+    wait_for(lambda: slow._spare is not None)
+    done: list[int] = []
+
+    def job(number: int) -> None:
+        assert ask(slow, npy(make_cloud(seed=number))) is not None
+        done.append(number)
+
+    with ThreadPoolExecutor(4) as pool:
+        jobs = []
+        for number in range(4):
+            jobs.append(pool.submit(job, number))
+            wait_for(lambda expected=number + 1: len(slow._line) + len(slow._since) + len(done) >= expected)
+        for one in jobs:
+            one.result(PATIENCE_S)
+    assert done == [0, 1, 2, 3]
+    slow.close()
+
+
+def test_retired_workers_end_when_nobody_holds_them(workers: Workers) -> None:
+    workers.hold()
+    workers.retire()
+    assert workers.available
+    workers.release()
+    assert not workers.available
 
 
 def test_a_body_that_takes_too_much_memory_is_refused_and_costs_its_worker(

@@ -1,11 +1,11 @@
-"""The model that serves, the thread that asks its workers, and the exchange of models that no request notices."""
+"""The model that serves, the threads that ask its workers, and the exchange of models that no request notices."""
 
 from __future__ import annotations
 
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from attentionvote.contract import ModelCard
 from attentionvote.inference.answer import DIGEST_LENGTH
@@ -16,7 +16,7 @@ from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.refusal import Refusal, bad_request
 from attentionvote.inference.server.worker.workers import Workers
 
-T = TypeVar("T")
+_ASKING = 2  # threads, as many as workers
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Served:
 
 
 class Serving:
-    """The model that serves. All methods are called on the event loop; one thread asks the workers, in order.
+    """The model that serves. All methods are called on the event loop; two threads ask its workers.
 
     Args:
         metrics: to be told about the model.
@@ -67,7 +67,7 @@ class Serving:
         self.current: Served | None = None
         self.waits_for = "no bundle was loaded yet"
         self._metrics = metrics
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="jobs")
+        self._threads = ThreadPoolExecutor(_ASKING, thread_name_prefix="jobs")
         metrics.ready.set_function(lambda: float(self.available))
         metrics.worker_memory.set_function(self._worker_memory)
 
@@ -108,8 +108,8 @@ class Serving:
         return served
 
     def submit(self, work: Any, *arguments: Any) -> Future[Any]:
-        """Queue work for the thread that asks the workers."""
-        return self._thread.submit(work, *arguments)
+        """Queue work for the threads that ask the workers."""
+        return self._threads.submit(work, *arguments)
 
     def swap(self, served: Served) -> None:
         """Let another model serve. Requests that were queued before end on the old one, which is closed after them."""
@@ -126,12 +126,11 @@ class Serving:
             level=logging.WARNING if served.last_known_good or not served.kept else logging.INFO,
         )  # fmt: skip
         if old is not None and old.workers is not served.workers:
-            # One thread, first in first out: whatever was queued for the old one comes before this.
-            self._thread.submit(old.workers.close)
+            old.workers.retire()
 
     def close(self) -> None:
         """Take no more work; what is queued or runs is dropped."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._threads.shutdown(wait=False, cancel_futures=True)
         if self.current is not None:
             self.current.workers.close()
 

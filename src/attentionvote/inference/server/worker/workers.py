@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -17,11 +18,15 @@ from attentionvote.inference.server.worker.channel import Message, SharedContent
 from attentionvote.inference.server.worker.process import Loss, WorkerEnded, WorkerLost, WorkerProcess, WorkerSettings
 
 _TRIES = 5
+_PATIENCE_S = 1.0  # how long a job may keep the next one waiting
 _LOOK_S, _FIRST_RETRY_S, _LAST_RETRY_S = 0.5, 1.0, 60.0
 
 
 class Workers:
     """Two processes with one verified and self-tested bundle.
+
+    One job runs at a time, in the order of their coming. A job that runs for a second keeps nobody waiting any longer:
+    the next one goes to the spare.
 
     Args:
         bundle: verified.
@@ -50,7 +55,10 @@ class Workers:
         self.digest: str = bundle.digest
         self._bundle, self._settings, self._tell = bundle, settings, lost
         self._changed = threading.Condition()
-        self._closed = False
+        self._closed = self._retired = False
+        self._users = 0
+        self._line: deque[object] = deque()  # who waits, in order
+        self._since: dict[WorkerProcess, float] = {}  # when each busy worker began
         self._active: WorkerProcess | None = WorkerProcess(bundle, settings, self_test=True, polite=polite)
         self._spare: WorkerProcess | None = None
         threading.Thread(target=self._keep_a_spare, name="spare worker", daemon=True).start()
@@ -59,15 +67,34 @@ class Workers:
     def available(self) -> bool:
         """Whether a request would be worked on: a loaded worker is there that is not beyond a deadline."""
         with self._changed:
-            if self._closed:
-                return False
-            return any(one is not None and one.alive and not one.overdue for one in (self._active, self._spare))
+            return not self._closed and any(one.alive and not one.overdue for one in self._both())
 
     @property
     def memory_bytes(self) -> int:
         """Resident memory of both."""
         with self._changed:
-            return sum(one.memory_bytes for one in (self._active, self._spare) if one is not None)
+            return sum(one.memory_bytes for one in self._both())
+
+    def hold(self) -> None:
+        """Somebody will ask: they are not closed before :meth:`release`."""
+        with self._changed:
+            self._users += 1
+
+    def release(self) -> None:
+        """Whoever held them does not ask any more."""
+        with self._changed:
+            self._users -= 1
+            over = self._retired and not self._users
+        if over:
+            self.close()
+
+    def retire(self) -> None:
+        """Close them as soon as nobody holds them."""
+        with self._changed:
+            self._retired = True
+            over = not self._users
+        if over:
+            self.close()
 
     def ask(
         self,
@@ -76,14 +103,14 @@ class Workers:
         deadline: Deadline,
         renamed: Callable[[float], None] = lambda _: None,
     ) -> Message | None:
-        """Let a worker do a job; None when the deadline passed before there was one. One call at a time.
+        """Let a worker do a job; None when the deadline passed before there was one.
 
         Raises:
             WorkerLost: the job was lost with its worker; the next one gets another.
             RuntimeError: when they are closed.
         """
         for _ in range(_TRIES):
-            worker = self._loaded(deadline)
+            worker = self._take(deadline)
             if worker is None:
                 break
             try:
@@ -94,35 +121,58 @@ class Workers:
             except WorkerLost as loss:
                 self._drop(worker, loss.reason, loss.detail)
                 raise
+            finally:
+                with self._changed:
+                    self._since.pop(worker, None)
+                    self._changed.notify_all()
             if answer.head.get("status") == 422:
                 self._drop(worker, "memory", "a job needed more memory than --job-memory-mb allows")
             return answer
         return None
 
     def close(self) -> None:
-        """End both; a job that runs is lost."""
+        """End both at once; a job that runs is lost."""
         with self._changed:
             self._closed = True
-            workers = [one for one in (self._active, self._spare) if one is not None]
+            workers = self._both()
             self._active = self._spare = None
             self._changed.notify_all()
         for worker in workers:
             worker.kill()
 
-    def _loaded(self, deadline: Deadline) -> WorkerProcess | None:
-        """The worker that answers; while there is none, the spare's loading is waited for until the deadline."""
+    def _both(self) -> list[WorkerProcess]:
+        return [one for one in (self._active, self._spare) if one is not None]
+
+    def _take(self, deadline: Deadline) -> WorkerProcess | None:
+        """The worker for the next job in line; while there is none, it is waited for until the deadline."""
+        turn = object()
         with self._changed:
-            while not self._closed:
-                if self._active is None:
-                    self._active, self._spare = self._spare, None
-                    self._changed.notify_all()
-                if self._active is not None:
-                    return self._active
-                left = deadline.remaining_s()
-                if left <= 0:
-                    return None
-                self._changed.wait(left)
+            self._line.append(turn)
+            try:
+                while not self._closed:
+                    worker = self._idle() if self._line[0] is turn else None
+                    if worker is not None:
+                        self._since[worker] = time.monotonic()
+                        return worker
+                    left = deadline.remaining_s()
+                    if left <= 0:
+                        return None
+                    self._changed.wait(min(left, _PATIENCE_S / 4))
+            finally:
+                self._line.remove(turn)
+                self._changed.notify_all()
         raise RuntimeError("the workers are closed: a request came after the server's end")
+
+    def _idle(self) -> WorkerProcess | None:
+        """The active worker when it has nothing to do, the spare when that one's job takes long."""
+        if self._active is None:
+            self._active, self._spare = self._spare, None
+            self._changed.notify_all()
+        if self._active is None or self._active not in self._since:
+            return self._active
+        if self._spare in self._since or time.monotonic() - self._since[self._active] < _PATIENCE_S:
+            return None
+        return self._spare
 
     def _drop(self, worker: WorkerProcess, reason: Loss, detail: str) -> None:
         """A worker is lost: the spare takes its place at once, and another spare is started."""
@@ -150,7 +200,7 @@ class Workers:
                     self._changed.wait(_LOOK_S)
                 if self._closed:
                     return
-                idle = [one for one in (self._active, self._spare) if one is not None and one.ended_idle]
+                idle = [one for one in self._both() if one.ended_idle]
                 missing, alone = self._spare is None, self._active is None
             for worker in idle:
                 self._drop(worker, "crashed", "a worker ended while it had nothing to do")
