@@ -224,7 +224,7 @@ def _metrics(url: str) -> dict[str, float]:
         "answered": int(values["requests_total", "ok"] + values["requests_total", "abstained"]),
         "overloaded": int(values["requests_total", "overloaded"]),
         "estimate_s": values["request_seconds_sum", "estimate"] / max(count, 1),
-        "memory": values["peak_memory_bytes",],
+        "memory": values["peak_memory_bytes",] + values["worker_memory_bytes",],
     }
 
 
