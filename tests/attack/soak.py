@@ -2,7 +2,7 @@
 
 ``python tests/attack/soak.py BUNDLE --key signing.pub --seconds 600``: silent and dripping clients, damaged scans,
 bombs, workers that are stopped or killed, and model swaps; the good client compares every answer with an estimator's.
-One line of JSON on stdout; exit code 1 when an answer was wrong or lost, came later than 3 s after a fault, or memory grew.
+One line of JSON on stdout; exit code 1 when an answer was wrong, lost, or later than 3 s after a fault, or memory grew.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from attentionvote.geometry import native
+from attentionvote.geometry import native, pointcloud
 from attentionvote.geometry.pointcloud import (
     back_project,
     estimate_normals,
@@ -44,7 +44,7 @@ def test_missing_depth_gives_no_points() -> None:
     ("depth", "change", "words"),
     [
         (np.ones(4), {}, r"depth must be an image \(H, W\), got shape \(4,\)"),
-        (np.array([[1.0, -0.25]]), {}, r"depth must not be negative, got -0\.25 m as its minimum"),
+        (np.array([[1.0, -0.25]]), {}, r"depth must not be negative, got -0\.25 m"),
         (np.ones((2, 2)), {"fx": 0.0}, "focal lengths must be positive pixels, got fx 0.0 and fy 400.0"),
         (np.ones((2, 2)), {"fy": float("nan")}, "focal lengths must be positive pixels"),
     ],
@@ -195,3 +195,14 @@ def test_places_that_are_repeated_take_no_longer() -> None:
     few = np.repeat(places, 4, axis=0)
     expected = estimate_normals_reference(few, few, 30)
     np.testing.assert_allclose(np.abs((estimate_normals(few, few, 30) * expected).sum(axis=1)), 1, atol=1e-5)
+
+
+def test_an_image_of_many_rows_is_projected_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    depth = np.where(rng.random((301, 7)) < 0.2, np.nan, rng.uniform(0.5, 2, (301, 7)))
+    points, pixels = back_project(depth, **CAMERA)
+    monkeypatch.setattr(pointcloud, "_ROWS", 1000)
+    whole, places = back_project(depth, **CAMERA)
+    np.testing.assert_array_equal(points, whole)
+    np.testing.assert_array_equal(pixels, places)
+    assert len(back_project(np.zeros((0, 7)), **CAMERA)[0]) == 0

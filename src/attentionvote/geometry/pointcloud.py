@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from attentionvote.geometry import native
 
 NORMAL_NEIGHBORS = 30
+_ROWS = 128  # of a depth image at a time
 
 
 def back_project(
@@ -31,14 +32,25 @@ def back_project(
         raise ValueError(f"depth must be an image (H, W), got shape {depth.shape}")
     if not (fx > 0 and fy > 0):
         raise ValueError(f"focal lengths must be positive pixels, got fx {fx} and fy {fy}")
-    valid = np.isfinite(depth)
-    if (depth[valid] < 0).any():
-        raise ValueError(f"depth must not be negative, got {float(depth[valid].min()):.4g} m as its minimum")
-    pixels = np.flatnonzero(valid & (depth > 0))
-    z = depth.reshape(-1)[pixels].astype(np.float64)
-    v, u = np.divmod(pixels, depth.shape[1])
-    points = np.stack([(u - cx) * z / fx, (v - cy) * z / fy, z], axis=-1)
-    return points.astype(np.float32), pixels
+    parts = [_back_projected(depth[top : top + _ROWS], top, fx, fy, cx, cy) for top in range(0, len(depth), _ROWS)]
+    points = [points for points, _ in parts] or [np.zeros((0, 3), np.float32)]
+    pixels = [pixels for _, pixels in parts] or [np.zeros(0, np.int64)]
+    return np.concatenate(points), np.concatenate(pixels)
+
+
+def _back_projected(
+    rows: NDArray[np.floating], top: int, fx: float, fy: float, cx: float, cy: float
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Some rows of an image, so that its numbers in double precision are never there at once; ``top`` is the first."""
+    valid = np.isfinite(rows)
+    if (rows[valid] < 0).any():
+        raise ValueError(f"depth must not be negative, got {float(rows[valid].min()):.4g} m")
+    pixels = np.flatnonzero(valid & (rows > 0))
+    z = rows.reshape(-1)[pixels].astype(np.float64)
+    v, u = np.divmod(pixels, rows.shape[1])
+    points = np.empty((len(pixels), 3), np.float32)
+    points[:, 0], points[:, 1], points[:, 2] = (u - cx) * z / fx, (v + top - cy) * z / fy, z
+    return points, pixels + top * rows.shape[1]
 
 
 def estimate_normals(
