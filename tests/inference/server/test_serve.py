@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -224,3 +226,16 @@ main(["serve", {str(make_bundle())!r}, "--key", {str(trusted_key)!r}, "--port", 
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[1])["answer"] == "estimate"
     assert list(home.rglob("*")) == []
+
+
+def test_a_body_does_not_wait_for_its_head_to_be_acknowledged(shared_server: Any) -> None:
+    """Sockets whose protocol is not named are sent with Nagle's delay: 40 ms an answer on a connection that is kept."""
+    connection = http.client.HTTPConnection(shared_server.address, timeout=20)
+    seconds = []
+    for _ in range(21):
+        begun = time.monotonic()
+        connection.request("POST", "/poses", b"nothing")
+        assert connection.getresponse().read()
+        seconds.append(time.monotonic() - begun)
+    connection.close()
+    assert sorted(seconds)[10] < 0.03
