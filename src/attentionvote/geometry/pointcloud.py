@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from attentionvote.geometry import native
 
@@ -104,6 +103,9 @@ def estimate_normals_reference(
     points: NDArray[np.float32], asked: NDArray[np.float32], neighbors: int
 ) -> NDArray[np.float32]:
     """``estimate_normals`` of checked arguments with scipy's kd-tree and LAPACK; ``neighbors`` at most all points."""
+    # Where the C code is, nothing else needs scipy: a cell's processes start sooner and are smaller without it.
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False, leafsize=32)
     index = tree.query(asked, k=range(1, neighbors + 1))[1]
     near = points.astype(np.float64)[index]

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from attentionvote.inference.bundles.bundle import Bundle, GoldenCloud, load_bundle, write_manifest
     from attentionvote.inference.bundles.signature import keys_folder, load_private_key, load_public_key, make_keys
     from attentionvote.inference.cell import Cell, read_cell
+    from attentionvote.inference.crop import Crop
     from attentionvote.inference.errors import BundleError, DeadlineExceeded, InputError
     from attentionvote.inference.estimator import PoseEstimator
     from attentionvote.inference.golden import self_test
-    from attentionvote.inference.preparation import Crop
     from attentionvote.inference.scans.cloud_files import read_cloud
     from attentionvote.inference.scans.depth_files import CameraIntrinsics, read_depth
 
@@ -24,7 +24,7 @@ _MODULE_OF = {
     "BundleError": "errors",
     "CameraIntrinsics": "scans.depth_files",
     "Cell": "cell",
-    "Crop": "preparation",
+    "Crop": "crop",
     "DeadlineExceeded": "errors",
     "Detection": "answer",
     "Estimate": "answer",

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.inference.crop import Crop
 from attentionvote.inference.errors import InputError
-from attentionvote.inference.preparation import Crop
 from attentionvote.inference.scans.depth_files import CameraIntrinsics
 from attentionvote.inference.scans.limits import BLOCK_ROWS
 

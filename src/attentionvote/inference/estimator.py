@@ -18,10 +18,11 @@ from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection,
 from attentionvote.inference.blind_sensor import LEAST_SHARE, BlindSensor
 from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder
+from attentionvote.inference.crop import Crop
 from attentionvote.inference.errors import DeadlineExceeded, InputError
 from attentionvote.inference.measured_points import measured_points
 from attentionvote.inference.pose_check import plausible
-from attentionvote.inference.preparation import Crop, TooFewPoints, find_neighbors, prepare
+from attentionvote.inference.preparation import TooFewPoints, find_neighbors, prepare
 from attentionvote.inference.runtime import Session
 from attentionvote.inference.scans.depth_files import CameraIntrinsics
 from attentionvote.inference.scans.limits import MOST_POINTS

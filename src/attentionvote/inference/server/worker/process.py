@@ -85,7 +85,7 @@ class WorkerProcess:
         self._open = True
         self._output = os.memfd_create("attentionvote-worker", os.MFD_CLOEXEC)
         try:
-            self._start()
+            self._start(settings.threads)
         except BaseException:
             os.close(self._output)
             raise
@@ -184,7 +184,7 @@ class WorkerProcess:
         """It works on something that should have ended half an overrun after its deadline."""
         self._busy_until = time.monotonic() + max(deadline.remaining_s(), 0.0) + OVERRUN_S / 2
 
-    def _start(self) -> None:
+    def _start(self, threads: int) -> None:
         self._channel, inner = Channel.pair()
         reading, self._lifeline = os.pipe2(os.O_CLOEXEC)
         words = [sys.executable, "-P", "-m", "attentionvote.inference.server.worker.main"]
@@ -197,7 +197,9 @@ class WorkerProcess:
                 stdout=self._output,
                 stderr=self._output,
                 pass_fds=(inner.fileno(), reading),
-                env={name: value for name, value in os.environ.items() if name not in secrets},
+                # One thread a worker but for those it was given: a machine of 64 cores would start as many in each.
+                env={name: value for name, value in os.environ.items() if name not in secrets}
+                | {"OPENBLAS_NUM_THREADS": str(threads)},
             )
         except BaseException:
             self._channel.close()
