@@ -80,7 +80,16 @@ def test_the_stock_triton_client_sees_health_and_metadata(shared_server: Any) ->
         assert version == shared_server.version()
         assert client.is_model_ready("bracket", version)
         assert metadata["inputs"] == [{"name": "points", "datatype": "FP32", "shape": [-1, 3]}]
-        assert [o["name"] for o in metadata["outputs"]] == ["camera_from_part", "confidence", "heat"]
+        outputs = {o["name"]: (o["datatype"], o["shape"]) for o in metadata["outputs"]}
+        assert outputs == {
+            "camera_from_part": ("FP64", [-1, 4, 4]),
+            "confidence": ("FP32", [-1]),
+            "heat": ("FP32", [-1]),
+            "class_index": ("INT64", [-1]),
+            "part": ("BYTES", [-1]),
+        }
+        (part,) = metadata["parameters"]["parts"]
+        assert (part["class_index"], part["name"], part["diameter"]) == (0, "bracket", 0.1)
         assert client.get_model_repository_index() == [
             {"name": "bracket", "version": version, "state": "READY", "reason": ""}
         ]
@@ -180,10 +189,10 @@ def test_json_answers_without_binary_have_no_length_header(
     assert "Inference-Header-Content-Length" not in reply.headers
     assert reply.headers["content-type"] == "application/json"
     shapes = {output["name"]: output["shape"] for output in reply.json["outputs"]}
-    assert shapes == {"camera_from_part": [2, 4, 4], "confidence": [2], "heat": [2]}
+    assert shapes == {"camera_from_part": [2, 4, 4], "confidence": [2], "heat": [2], "class_index": [2], "part": [2]}
     body, headers = infer_body(make_cloud(), binary_data_output=True)
     reply = shared_server.post("/v2/models/bracket/infer", body, headers)
     head = json.loads(reply.body[: int(reply.headers["Inference-Header-Content-Length"])])
     sizes = [output["parameters"]["binary_data_size"] for output in head["outputs"]]
-    assert sizes == [2 * 16 * 8, 2 * 4, 2 * 4]
+    assert sizes == [2 * 16 * 8, 2 * 4, 2 * 4, 2 * 8, 2 * (4 + len("bracket"))]
     assert len(reply.body) == int(reply.headers["Inference-Header-Content-Length"]) + sum(sizes)
