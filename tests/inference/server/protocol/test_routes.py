@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -196,3 +197,31 @@ def test_json_answers_without_binary_have_no_length_header(
     sizes = [output["parameters"]["binary_data_size"] for output in head["outputs"]]
     assert sizes == [2 * 16 * 8, 2 * 4, 2 * 4, 2 * 8, 2 * (4 + len("bracket"))]
     assert len(reply.body) == int(reply.headers["Inference-Header-Content-Length"]) + sum(sizes)
+
+
+def test_tritons_config_and_statistics_are_true(start_server: Any, bundle_folder: Path, make_cloud: Any) -> None:
+    server = start_server(bundle_folder)
+    with triton_client(server.address) as client:
+        config = client.get_model_config("bracket")
+        assert (config["name"], config["max_batch_size"]) == ("bracket", 0)
+        assert config["input"] == [{"name": "points", "data_type": "TYPE_FP32", "dims": [-1, 3]}]
+        assert config["output"][0] == {"name": "camera_from_part", "data_type": "TYPE_FP64", "dims": [-1, 4, 4]}
+        assert config["output"][-1] == {"name": "part", "data_type": "TYPE_STRING", "dims": [-1]}
+        (before,) = client.get_inference_statistics()["model_stats"]
+        assert (before["inference_count"], before["last_inference"]) == (0, 0)
+        for _ in range(3):
+            client.infer("bracket", [cloud_input(make_cloud(), True)])
+        with pytest.raises(triton.InferenceServerException, match="were millimetres sent"):
+            client.infer("bracket", [cloud_input(make_cloud() * 1000, True)])
+        (after,) = client.get_inference_statistics("bracket", server.version())["model_stats"]
+        assert (after["name"], after["version"]) == ("bracket", server.version())
+        assert after["inference_count"] == after["execution_count"] == 3
+        spent = after["inference_stats"]
+        counts = {key: value["count"] for key, value in spent.items()}
+        assert counts == {"success": 3, "fail": 1, "queue": 3, "compute_input": 3, "compute_infer": 3}
+        assert 0 < spent["compute_infer"]["ns"] < spent["success"]["ns"]
+        assert abs(after["last_inference"] / 1e3 - time.time()) < 60
+        for ask in (client.get_model_config, client.get_inference_statistics):
+            with pytest.raises(triton.InferenceServerException, match="got 'gear'") as caught:
+                ask("gear")
+            assert caught.value.status() == "404"
