@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -59,7 +60,9 @@ def test_the_end_takes_less_than_docker_waits(start_server: Any, bundle_folder: 
         server.wait_until(lambda: server.metric("queue_depth") == 1, "the request is received")
         begun = time.monotonic()
         server.process.send_signal(signal.SIGTERM)
-        reply = connection.recv(65536)
+        reply = b""
+        while piece := connection.recv(65536):
+            reply += piece
         assert server.process.wait(15) == 0
         assert time.monotonic() - begun < 9
     assert reply.startswith(b"HTTP/1.1 503 ")
@@ -84,3 +87,19 @@ def test_a_handshake_that_never_ends_does_and_takes_no_place_meanwhile(
         for connection in silent:
             connection.close()
     assert health.main(["--url", server.url]) == 0
+
+
+def test_without_a_file_handle_it_waits_says_so_once_and_goes_on(start_server: Any, bundle_folder: Path) -> None:
+    server = start_server(bundle_folder)
+    pid = server.process.pid
+    before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, before[1]))  # no handle beyond the first three
+    host, port = server.address.split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(b"GET /v2/health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        server.wait_until(lambda: bool(server.log("handles")), "the log says it")
+        time.sleep(1)  # ten more tries
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
+    (line,) = server.log("handles")
+    assert line["message"] == "no connection can be taken up: Too many open files; it is tried again"
