@@ -239,3 +239,38 @@ import attentionvote.inference.client.pose_client
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_server_of_version_0_1_says_no_parts() -> None:
+    """Its answer has three outputs: every pose is of the model's part."""
+    arrays = {
+        "camera_from_part": ("FP64", np.stack([np.eye(4)] * 2)),
+        "confidence": ("FP32", np.float32([0.9, 0.8])),
+        "heat": ("FP32", np.float32([4, 3])),
+    }
+    outputs = [
+        {"name": n, "datatype": d, "shape": list(a.shape), "parameters": {"binary_data_size": a.nbytes}}
+        for n, (d, a) in arrays.items()
+    ]
+    said = {"status": "ok", "message": "", "warnings": "", "part": "gear", "frame": "camera", "units": "m"}
+    head = json.dumps({"model_version": "12ab", "parameters": said, "outputs": outputs}).encode()
+    body = head + b"".join(array.tobytes() for _, array in arrays.values())
+    old = http("200 OK", body, f"Inference-Header-Content-Length: {len(head)}")
+    with scripted(old) as url, PoseClient(url, part="gear") as client:
+        answer = client.estimate(np.zeros((1, 3), np.float32))
+    assert answer.part_names == ("gear", "gear")
+    assert answer.class_index.tolist() == [0, 0]
+    assert [pose["part"] for pose in answer.to_dict()["poses"]] == ["gear", "gear"]
+
+
+@pytest.mark.parametrize("packed", [b"\xff\xff\xff\x7fbolt", b"\4\0\0\0bol", b"\1\0\0\0\xff", b"\1\0"])
+def test_texts_that_are_none(packed: bytes) -> None:
+    part = {"name": "part", "datatype": "BYTES", "shape": [1], "parameters": {"binary_data_size": len(packed)}}
+    head = json.dumps({"model_version": "1", "parameters": {}, "outputs": [part]}).encode()
+    answer = http("200 OK", head + packed, f"Inference-Header-Content-Length: {len(head)}")
+    with (
+        scripted(answer) as url,
+        PoseClient(url, part="x") as client,
+        pytest.raises(ServerFailed, match="must hold poses as binary tensors"),
+    ):
+        client.estimate(np.zeros((1, 3), np.float32))

@@ -93,6 +93,25 @@ def test_an_abstention_has_no_detections() -> None:
     assert content["header"]["stamp"] == {"sec": 7, "nanosec": 0}
 
 
+def test_every_part_has_its_own_box_and_a_part_without_is_refused() -> None:
+    found = (Detection(np.eye(4), 0.9, "bolt", 4.0), Detection(np.eye(4), 0.8, "plate", 4.0))
+    both = Estimate(detections=found, part="bin", model="1", points_given=9, points_measured=9, points_used=9).to_dict()
+    boxes = {"plate": ((0, 0, 0), (1, 2, 3)), "bolt": BOX}
+    detections = detection_array(both, boxes, "camera", 0.0)["detections"]
+    assert [d["results"][0]["hypothesis"]["class_id"] for d in detections] == ["bolt", "plate"]
+    assert detections[0]["bbox"]["size"] == {
+        "x": pytest.approx(0.12),
+        "y": pytest.approx(0.04),
+        "z": pytest.approx(0.04),
+    }
+    assert detections[1]["bbox"]["size"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+    assert detections[1]["bbox"]["center"]["position"] == {"x": 0.5, "y": 1.0, "z": 1.5}
+    del boxes["plate"]
+    sentence = "box must have the box of every part, got bolt and a pose of 'plate'"
+    with pytest.raises(InputError, match=sentence):
+        detection_array(both, boxes, "camera", 0.0)
+
+
 @pytest.mark.parametrize(
     ("stamp", "expected"),
     [

@@ -6,6 +6,7 @@ import http.client
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -131,7 +133,12 @@ class StartServer(Protocol):
     """What the fixture ``start_server`` offers."""
 
     def __call__(
-        self, bundle: Path, *options: str, environment: Mapping[str, str] | None = None, ready: bool = True
+        self,
+        bundle: Path,
+        *options: str,
+        environment: Mapping[str, str] | None = None,
+        ready: bool = True,
+        handles: int | None = None,
     ) -> ServerProcess: ...
 
 
@@ -144,7 +151,12 @@ class _Started:
     servers: list[ServerProcess] = field(default_factory=list)
 
     def start(
-        self, bundle: Path, *options: str, environment: Mapping[str, str] | None = None, ready: bool = True
+        self,
+        bundle: Path,
+        *options: str,
+        environment: Mapping[str, str] | None = None,
+        ready: bool = True,
+        handles: int | None = None,
     ) -> ServerProcess:
         number = len(self.servers)
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -161,6 +173,7 @@ class _Started:
                 stderr=log,
                 text=True,
                 env={**os.environ, **(environment or {})},
+                preexec_fn=None if handles is None else partial(_limit_handles, handles),
             )
         assert process.stdout is not None
         line = process.stdout.readline()
@@ -182,6 +195,11 @@ class _Started:
                 server.kill()
             assert server.process.stdout is not None
             server.process.stdout.close()
+
+
+def _limit_handles(handles: int) -> None:
+    """``ulimit -n``."""
+    resource.setrlimit(resource.RLIMIT_NOFILE, (handles, handles))
 
 
 def _no_tracebacks(started: _Started) -> None:

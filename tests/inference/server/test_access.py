@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from attentionvote.inference.errors import InputError
-from attentionvote.inference.server.access import Tokens, check_host, is_loopback
+from attentionvote.inference.server.access import Tokens, check_host, is_loopback, names_this_machine
 
 SECRET = "s3cret-" + "x" * 20
 
@@ -79,3 +79,26 @@ def test_without_a_token_only_the_machine_itself_may_call(token_file: Path) -> N
         with pytest.raises(InputError, match=r"must be a loopback address .* without --token-file, got"):
             check_host(host, None)
         check_host(host, Tokens(token_file))
+
+
+@pytest.mark.parametrize("header", ["localhost", "LOCALHOST:8000", "127.0.0.1", "127.8.8.8:1", "[::1]", "[::1]:8000"])
+def test_hosts_that_name_this_machine(header: str) -> None:
+    assert names_this_machine(header)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "x",
+        "evil.example:8000",
+        "localhost.evil.example",
+        "192.168.0.1",
+        "[::2]:80",
+        "[::1",
+        "user@evil",
+        "1.1.1.1#@localhost",
+    ],
+)
+def test_hosts_that_do_not(header: str) -> None:
+    assert not names_this_machine(header)

@@ -83,7 +83,7 @@ def test_a_deadline_that_is_none_is_refused(shared_server: Any, make_cloud: Any,
 def test_a_body_that_never_ends_is_given_up_at_the_deadline(shared_server: Any) -> None:
     host, port = shared_server.address.split(":")
     with socket.create_connection((host, int(port)), timeout=10) as connection:
-        head = b"POST /poses HTTP/1.1\r\nHost: x\r\nConnection: close\r\nX-Deadline-Ms: 150\r\n"
+        head = b"POST /poses HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nX-Deadline-Ms: 150\r\n"
         connection.sendall(head + b"Content-Length: 5000\r\n\r\nhello")
         reply = b""
         while piece := connection.recv(65536):
@@ -102,7 +102,7 @@ def test_a_client_that_leaves_takes_its_queued_work_with_it(slow_server: Any, ma
     running.start()
     server.wait_until(lambda: server.metric("queue_depth") == 1, "the first request runs")
     with socket.create_connection((host, int(port)), timeout=10) as connection:
-        connection.sendall(b"POST /poses HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body) + body)
+        connection.sendall(b"POST /poses HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(body) + body)
         server.wait_until(lambda: server.metric("queue_depth") == 2, "the second request waits")
     server.wait_until(lambda: server.metric("requests_total", outcome="gone") == 1, "the client's leaving is noticed")
     running.join()

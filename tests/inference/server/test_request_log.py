@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -61,3 +62,26 @@ def test_every_line_is_json_with_the_same_beginning(shared_server: Any) -> None:
         content = json.loads(line)
         assert list(content)[:3] == ["time", "level", "event"]
         assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", content["time"])
+
+
+def test_without_a_token_only_this_machine_s_names_are_answered(shared_server: Any) -> None:
+    for path in ("/v2", "/v2/health/live", "/metrics"):
+        refused = shared_server.ask("GET", path, headers={"Host": "evil.example:8000"})
+        assert refused.status == 421
+        assert refused.error == (
+            "the header Host must name this machine, such as localhost, without --token-file, got 'evil.example:8000': "
+            "ask 127.0.0.1, or start the server with a token file"
+        )
+        assert shared_server.ask("GET", path, headers={"Host": "localhost:1"}).status == 200
+    host, port = shared_server.address.split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection:
+        connection.sendall(b"GET /v2 HTTP/1.0\r\n\r\n")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
+
+
+def test_with_a_token_any_name_is_answered(start_server: Any, bundle_folder: Path, tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text(TOKEN)
+    server = start_server(bundle_folder, "--token-file", str(token), ready=False)
+    headers = {"Host": "cell.example", "Authorization": f"Bearer {TOKEN}"}
+    assert server.ask("GET", "/v2", headers=headers).status == 200

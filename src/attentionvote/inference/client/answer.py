@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LENGTH_HEADER = "Inference-Header-Content-Length"
-_DTYPES = {"FP32": "<f4", "FP64": "<f8"}
+_DTYPES = {"FP32": "<f4", "FP64": "<f8", "INT64": "<i8"}
 
 
 class PoseClientError(RuntimeError):
@@ -49,10 +50,12 @@ class Answer:
         camera_from_part: ``(n, 4, 4)`` float64, metres, most confident first.
         confidence: ``(n,)`` float32.
         heat: ``(n,)`` float32, how many votes agree on each.
+        class_index: ``(n,)`` int64, which of the model's parts each pose is of (``parts`` of the server's metadata).
+        part_names: the name of that part, one a pose.
         status: ``ok``, or the reason why there is none: one of ``inference.answer.REASONS``.
         message: the status in a sentence; empty when ok.
         warnings: about an unusual cloud; empty without.
-        part: what was looked for.
+        part: what was looked for: the model's name, of a set of parts the set's.
         version: of the model, the first digits of its bundle's digest.
         frame, units: of the poses.
     """
@@ -60,6 +63,8 @@ class Answer:
     camera_from_part: NDArray[np.float64]
     confidence: NDArray[np.float32]
     heat: NDArray[np.float32]
+    class_index: NDArray[np.int64]
+    part_names: tuple[str, ...]
     status: str
     message: str
     warnings: str
@@ -70,19 +75,19 @@ class Answer:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data with the list ``poses``, as ``/poses`` answers it."""
-        poses = zip(self.camera_from_part.tolist(), self.confidence.tolist(), self.heat.tolist(), strict=True)
+        columns = self.camera_from_part.tolist(), self.confidence.tolist(), self.heat.tolist(), self.part_names
         names = ("status", "message", "warnings", "part", "version", "frame", "units")
         return {
             "poses": [
-                {"camera_from_part": pose, "confidence": confidence, "heat": heat, "part": self.part}
-                for pose, confidence, heat in poses
+                {"camera_from_part": pose, "confidence": confidence, "heat": heat, "part": part}
+                for pose, confidence, heat, part in zip(*columns, strict=True)
             ],
             **{name: getattr(self, name) for name in names},
         }
 
 
 def decode_answer(body: bytes, header_length: str | None) -> Answer:
-    """The answer in a response with binary tensors.
+    """The answer in a response with binary tensors. Servers of version 0.1 do not say which part a pose is of.
 
     Args:
         body: of the response.
@@ -94,17 +99,26 @@ def decode_answer(body: bytes, header_length: str | None) -> Answer:
     try:
         length = int(header_length or "")
         content = json.loads(body[:length])
-        tensors, at = {}, length
+        tensors: dict[str, NDArray[Any]] = {}
+        names: tuple[str, ...] | None = None
+        at = length
         for output in content["outputs"]:
             size = output["parameters"]["binary_data_size"]
-            values = np.frombuffer(body[at : at + size], dtype=_DTYPES[output["datatype"]])
-            tensors[output["name"]] = values.reshape(output["shape"])
+            piece = body[at : at + size]
             at += size
+            if output["name"] == "part":
+                names = _texts(piece, int(output["shape"][0]))
+            else:
+                values = np.frombuffer(piece, dtype=_DTYPES[output["datatype"]])
+                tensors[output["name"]] = values.reshape(output["shape"])
         said = content["parameters"]
+        n = len(tensors["confidence"])
         return Answer(
             tensors["camera_from_part"],
             tensors["confidence"],
             tensors["heat"],
+            tensors.get("class_index", np.zeros(n, np.int64)),
+            (str(said["part"]),) * n if names is None else names,
             status=str(said["status"]),
             message=str(said["message"]),
             warnings=str(said["warnings"]),
@@ -113,5 +127,17 @@ def decode_answer(body: bytes, header_length: str | None) -> Answer:
             frame=str(said["frame"]),
             units=str(said["units"]),
         )
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, struct.error) as error:
         raise ServerFailed(f"the answer must hold poses as binary tensors, but it cannot be read ({error})") from error
+
+
+def _texts(packed: bytes, count: int) -> tuple[str, ...]:
+    """Texts that each follow their length (32 bits, little-endian)."""
+    texts, at = [], 0
+    for _ in range(count):
+        (length,) = struct.unpack_from("<I", packed, at)
+        at += 4 + length
+        if at > len(packed):
+            raise ValueError("a text is cut off")
+        texts.append(packed[at - length : at].decode())
+    return tuple(texts)

@@ -31,6 +31,7 @@ from attentionvote.inference.client.answer import (
     Unreachable,
     decode_answer,
 )
+from attentionvote.inference.client.timed_connection import TimedConnection
 
 __all__ = [
     "Answer",
@@ -61,7 +62,8 @@ class PoseClient:
     Args:
         url: ``http://HOST:PORT`` or ``https://HOST:PORT``.
         token: of the server's token file; None when it asks for none.
-        timeout_s: longest time a call may take when it names no deadline.
+        timeout_s: longest time a call may take when it names no deadline: connecting, sending, waiting, reading and
+            asking again, all together, and at most one second more.
         part: the part that must be served; None takes what is served at the first call and holds on to it.
         ca_file: certificates to trust instead of the system's.
 
@@ -86,7 +88,7 @@ class PoseClient:
         self._tls = ssl.create_default_context(cafile=ca_file) if parts.scheme == "https" else None
         self._headers = {"Authorization": f"Bearer {token}"} if token is not None else {}
         self._timeout_s, self._part = timeout_s, part
-        self._connection: http.client.HTTPConnection | None = None
+        self._connection: TimedConnection | None = None
 
     def estimate(self, points: NDArray[Any], deadline_ms: float | None = None) -> Answer:
         """Poses of the parts in a cloud.
@@ -95,7 +97,8 @@ class PoseClient:
 
         Args:
             points: ``(P, 3)`` metres, camera frame.
-            deadline_ms: for everything together, retries included; the client's ``timeout_s`` when None.
+            deadline_ms: for everything together, retries included, and a second more for the answer; the
+                client's ``timeout_s`` when None.
 
         Raises:
             ValueError: when the points are no numbers of that shape.
@@ -125,7 +128,7 @@ class PoseClient:
     def ready(self) -> bool:
         """Whether the server is reachable and a verified model serves."""
         try:
-            return self._send("GET", "/v2/health/ready", b"", {}, self._timeout_s).status == 200
+            return self._send("GET", "/v2/health/ready", b"", {}, self._patience()).status == 200
         except (Unreachable, DeadlinePassed):
             return False
 
@@ -135,7 +138,11 @@ class PoseClient:
         Raises:
             PoseClientError: one of its kinds.
         """
-        return _json(self._checked(self._send("GET", "/", b"", {}, self._timeout_s)))
+        return _json(self._checked(self._send("GET", "/", b"", {}, self._patience())))
+
+    def _patience(self) -> float:
+        """When a call without a deadline of its own ends, of the monotonic clock."""
+        return time.monotonic() + self._timeout_s
 
     def close(self) -> None:
         """Close the connection; the next call opens another."""
@@ -156,7 +163,7 @@ class PoseClient:
             if left <= 0:
                 raise DeadlinePassed(f"{self._url} did not answer within the deadline")
             deadline = {"X-Deadline-Ms": f"{min(max(1e3 * left, 1.0), 60_000.0):.0f}"}
-            response = self._send(method, path, body, {**headers, **deadline}, left + _GRACE_S)
+            response = self._send(method, path, body, {**headers, **deadline}, end + _GRACE_S)
             if response.status == 200 and path == "/" and _json(response)["model"] is None:
                 wait, unavailable = 0.5, Unavailable(f"{self._url} serves no model yet")
             elif response.status == 503:
@@ -167,38 +174,36 @@ class PoseClient:
                 raise unavailable
             time.sleep(wait)
 
-    def _send(self, method: str, path: str, body: bytes, headers: Mapping[str, str], timeout_s: float) -> _Response:
+    def _send(self, method: str, path: str, body: bytes, headers: Mapping[str, str], until: float) -> _Response:
         """One exchange. A kept connection that the server has closed meanwhile is replaced once."""
         while True:
             fresh = self._connection is None
             try:
-                return self._exchange(method, path, body, headers, timeout_s)
+                return self._exchange(method, path, body, headers, until)
             except TimeoutError as error:
                 self.close()
-                raise DeadlinePassed(f"{self._url} did not answer within {timeout_s:.1f} s") from error
+                raise DeadlinePassed(f"{self._url} did not answer within the deadline") from error
             except (OSError, http.client.HTTPException) as error:
                 self.close()
                 if fresh:
                     reason = str(error) or type(error).__name__
                     raise Unreachable(f"{self._url} cannot be reached: {reason}") from error
 
-    def _exchange(self, method: str, path: str, body: bytes, headers: Mapping[str, str], timeout_s: float) -> _Response:
+    def _exchange(self, method: str, path: str, body: bytes, headers: Mapping[str, str], until: float) -> _Response:
         connection = self._connection
         if connection is None:
-            if self._tls is not None:
-                connection = http.client.HTTPSConnection(self._host, self._port, timeout=timeout_s, context=self._tls)
-            else:
-                connection = http.client.HTTPConnection(self._host, self._port, timeout=timeout_s)
-            self._connection = connection
-        connection.timeout = timeout_s  # of the next connection attempt
-        if connection.sock is not None:
-            connection.sock.settimeout(timeout_s)
+            connection = self._connection = TimedConnection(self._host, self._port, self._tls)
+        connection.until = until
         connection.request(method, path, body=body or None, headers={**self._headers, **headers})
         response = connection.getresponse()
-        if response.length is None or response.length > _MOST_ANSWER_BYTES:
+        if response.length is not None and response.length <= _MOST_ANSWER_BYTES:
+            return _Response(response.status, response.headers, response.read())
+        # A proxy may send chunks, whose sum nobody knows before.
+        content = response.read(_MOST_ANSWER_BYTES + 1) if response.length is None else b""
+        if response.length is not None or len(content) > _MOST_ANSWER_BYTES:
             self.close()
-            raise ServerFailed(f"the answer must have at most {_MOST_ANSWER_BYTES} bytes, got another length")
-        return _Response(response.status, response.headers, response.read())
+            raise ServerFailed(f"the answer must have at most {_MOST_ANSWER_BYTES} bytes, got more")
+        return _Response(response.status, response.headers, content)
 
     def _checked(self, response: _Response) -> _Response:
         """The response when it is a good one.

@@ -14,37 +14,59 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from attentionvote.geometry.pose import quaternion_from_matrix
-from attentionvote.inference.errors import InputError
+from attentionvote.inference.errors import InputError, nearest
 
 
 def detection_array(
-    answer: Mapping[str, Any], box: ArrayLike, frame_id: str, stamp_s: float | tuple[int, int]
+    answer: Mapping[str, Any],
+    box: ArrayLike | Mapping[str, ArrayLike],
+    frame_id: str,
+    stamp_s: float | tuple[int, int],
 ) -> dict[str, Any]:
     """An answer in the shape of ``vision_msgs/Detection3DArray``; no poses, no detections.
 
     Args:
         answer: of ``/poses``, of an estimator's ``to_dict()`` or of the client's ``Answer.to_dict()``.
-        box: ``(2, 3)`` lowest and highest corner of the part in its own frame, metres: ``part.box`` of the card, which
-            ``PoseClient.metadata()`` has under ``model``.
+        box: ``(2, 3)`` lowest and highest corner of the part in its own frame, metres, or one such box for each name
+            of a part: ``{part["name"]: part["box"] for part in PoseClient.metadata()["model"]["parts"]}``.
         frame_id: of the camera's optical frame.
         stamp_s: when the cloud was measured: seconds since the epoch, or whole seconds and nanoseconds.
 
     Raises:
-        InputError: when the answer has no poses, or box, frame or time is impossible.
+        InputError: when the answer has no poses, a pose's part no box, or box, frame or time is impossible.
     """
-    corners = np.asarray(box, dtype=np.float64)
-    if corners.shape != (2, 3) or not (np.isfinite(corners).all() and (corners[0] <= corners[1]).all()):
-        raise InputError(f"box must be the lowest and the highest corner (2, 3) in metres, got {corners.tolist()}")
+    boxes = {name: _corners(each) for name, each in box.items()} if isinstance(box, Mapping) else _corners(box)
     if not frame_id:
         raise InputError("frame_id must name the camera's optical frame, got an empty text")
     poses = answer.get("poses")
     if not isinstance(poses, Sequence) or isinstance(poses, str):
         raise InputError("an answer must have the list poses, got none: was the request refused?")
     header = {"stamp": _stamp(stamp_s), "frame_id": frame_id}
-    return {"header": header, "detections": [_detection(pose, i, corners, header) for i, pose in enumerate(poses)]}
+    detections = [_detection(pose, i, _box_of(pose, boxes), header) for i, pose in enumerate(poses)]
+    return {"header": header, "detections": detections}
+
+
+def _corners(box: ArrayLike) -> NDArray[np.float64]:
+    corners = np.asarray(box, dtype=np.float64)
+    if corners.shape != (2, 3) or not (np.isfinite(corners).all() and (corners[0] <= corners[1]).all()):
+        raise InputError(f"box must be the lowest and the highest corner (2, 3) in metres, got {corners.tolist()}")
+    return corners
+
+
+def _box_of(
+    pose: Mapping[str, Any], boxes: NDArray[np.float64] | Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """The box of the pose's part."""
+    if not isinstance(boxes, Mapping):
+        return boxes
+    name = str(pose["part"])
+    if name not in boxes:
+        hint = nearest(name, boxes)
+        raise InputError(f"box must have the box of every part, got {', '.join(boxes)} and a pose of {name!r}{hint}")
+    return boxes[name]
 
 
 def _stamp(stamp_s: float | tuple[int, int]) -> dict[str, int]:

@@ -7,6 +7,7 @@ import hmac
 import ipaddress
 import os
 import stat
+import urllib.parse
 from pathlib import Path
 
 from attentionvote.inference.errors import InputError
@@ -76,3 +77,12 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def names_this_machine(host_header: str) -> bool:
+    """Whether a ``Host`` header, with or without a port, names the loopback interface."""
+    try:
+        host = urllib.parse.urlsplit(f"//{host_header}").hostname or ""
+    except ValueError:  # half an IPv6 address
+        return False
+    return is_loopback(host)

@@ -18,6 +18,7 @@ from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.serving import Served, Serving
 from attentionvote.inference.server.refusal import Refusal
+from attentionvote.inference.server.tally import Tally
 from attentionvote.inference.server.worker.channel import Message, SharedContent
 from attentionvote.inference.server.worker.process import WorkerLost
 
@@ -69,6 +70,7 @@ class Answering:
 
     def __init__(self, serving: Serving, gate: Gate, limits: Limits, metrics: Metrics) -> None:
         self.serving, self.gate, self.limits, self.metrics = serving, gate, limits, metrics
+        self.tally = Tally()
 
     async def ask(
         self, request: Request, job: Mapping[str, Any], name: str | None = None, version: str | None = None
@@ -107,6 +109,7 @@ class Answering:
         for stage in ("queue", "parse", "estimate"):
             if stage in record.seconds:
                 self._took(record, stage, record.seconds[stage])
+        self.tally.add(served.version, record.seconds, answered=answer.head["status"] == 200)
         self.gate.took(sum(record.seconds.get(stage, 0.0) for stage in ("parse", "estimate")))
         return self._response(answer, record)
 

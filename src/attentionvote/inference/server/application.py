@@ -23,6 +23,7 @@ from attentionvote.inference.server.answering import Answering
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.reloading import Watch
+from attentionvote.inference.server.protocol.answer import parts_of
 from attentionvote.inference.server.protocol.routes import ProtocolRoutes, registered
 from attentionvote.inference.server.refusal import Refusal, bad_request
 from attentionvote.inference.server.request_log import RequestLog
@@ -30,7 +31,8 @@ from attentionvote.inference.server.request_log import RequestLog
 DOCUMENTATION = "docs/operating-a-cell.md"
 _PATHS = (
     "/poses", "/metrics", "/v2", "/v2/health/live", "/v2/health/ready", "/v2/models/MODEL", "/v2/models/MODEL/infer",
-    "/v2/models/MODEL/ready", "/v2/repository/index", "/v2/repository/models/MODEL/load",
+    "/v2/models/MODEL/ready", "/v2/models/MODEL/config", "/v2/models/MODEL/stats",
+    "/v2/repository/index", "/v2/repository/models/MODEL/load",
 )  # fmt: skip
 
 
@@ -85,7 +87,7 @@ class _Pages:
         if served is not None:
             part = asdict(served.card.part)
             model = {"name": served.name, "version": served.version, "digest": served.digest, "part": part}
-            model |= registered(served)
+            model |= {"parts": parts_of(served.card), **registered(served)}
         content = {
             "name": "attentionvote",
             "version": self._version,

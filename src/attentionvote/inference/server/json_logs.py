@@ -6,7 +6,10 @@ import datetime
 import json
 import logging
 import sys
+import threading
 from typing import Any
+
+from attentionvote.inference.server.log_writer import LogWriter
 
 LOGGER = logging.getLogger("attentionvote.server")
 
@@ -30,13 +33,24 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, ensure_ascii=False, default=str)
 
 
-def configure() -> None:
+def configure() -> LogWriter:
     """Send every logger of the process through :class:`JsonLines` to stderr; libraries from warnings on."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonLines())
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    writer = LogWriter(sys.stderr.fileno())
+    writer.setFormatter(JsonLines())
+    logging.basicConfig(level=logging.WARNING, handlers=[writer], force=True)
     LOGGER.setLevel(logging.INFO)
     logging.captureWarnings(True)
+    # What Python itself writes to stderr about a thread would wait for the reader of a full pipe.
+    threading.excepthook = _thread_failed
+    return writer
+
+
+def _thread_failed(failure: threading.ExceptHookArgs) -> None:
+    name = failure.thread.name if failure.thread is not None else "unknown"
+    trace = None
+    if failure.exc_value is not None:
+        trace = (failure.exc_type, failure.exc_value, failure.exc_traceback)
+    LOGGER.error("the thread %s ended in an unforeseen way", name, exc_info=trace, extra={"event": "error"})
 
 
 def say(event: str, message: str = "", level: int = logging.INFO, *, trace: bool = False, **fields: Any) -> None:

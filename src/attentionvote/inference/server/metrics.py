@@ -19,6 +19,7 @@ SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5
 DETECTIONS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
 RELOADS = ("loaded", "refused", "failed", "last_known_good")
 LOSSES = ("deadline", "memory", "crashed")
+CLOSED = ("silent", "head", "handshake", "answer", "chunks")
 POLLS = ("answered", "away", "refused", "failed")
 
 
@@ -94,6 +95,14 @@ class Metrics:
         self.registry_failing = Gauge(
             prefix + "registry_failing", "1 while the registry cannot be followed", registry=self.registry
         )
+        self.connections = Gauge(prefix + "connections", "Open connections", registry=self.registry)
+        self.connections_closed = Counter(
+            prefix + "connections_closed", "Connections that the server ended before their client did, by reason",
+            ["reason"], registry=self.registry,
+        )  # fmt: skip
+        self.log_lines_dropped = Counter(
+            prefix + "log_lines_dropped", "Log lines that nobody read in time", registry=self.registry
+        )
         self.registry.register(_Memory())
         for outcome in OUTCOMES:
             self.requests.labels(outcome)
@@ -105,6 +114,8 @@ class Metrics:
             self.registry_polls.labels(outcome)
         for loss in LOSSES:
             self.workers_lost.labels(loss)
+        for closed in CLOSED:
+            self.connections_closed.labels(closed)
         for outcome in RELOADS:
             self.reloads.labels(outcome)
 

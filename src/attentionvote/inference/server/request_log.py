@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import secrets
@@ -11,7 +12,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from attentionvote.inference.server.access import OPEN_PATHS, Tokens
+from attentionvote.inference.server.access import OPEN_PATHS, Tokens, names_this_machine
 from attentionvote.inference.server.answering import Record
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
@@ -55,11 +56,18 @@ class RequestLog:
             await send(message)
 
         try:
+            self._check_place(scope)
+            self._check_host(headers)
             self._authorize(scope["path"], headers)
             await self._app(scope, receive, numbered)
         except Refusal as refusal:
             record.outcome, record.error = refusal.outcome, refusal.sentence
             await refusal.response()(scope, receive, numbered)
+        except asyncio.CancelledError:  # the server ends, and the time for open requests has passed
+            record.outcome = "unavailable"
+            if status == 0:
+                sentence = "the request must end while the server does, but it took longer: send it again"
+                await Refusal(503, sentence, "unavailable").response()(scope, receive, numbered)
         except ClientDisconnect:
             status, record.outcome = _GONE, "gone"
         except Exception:
@@ -69,6 +77,28 @@ class RequestLog:
                 sentence = f"internal error: the server's log has the details under request id {identity}"
                 await Refusal(500, sentence, "failed").response()(scope, receive, numbered)
         self._end(scope, record, identity, status, time.monotonic() - begun)
+
+    def _check_place(self, scope: Scope) -> None:
+        """A connection beyond the limit is there for questions about health."""
+        most = scope["state"].get("most_connections")
+        if most is not None and scope["path"] not in OPEN_PATHS:
+            raise Refusal(
+                503,
+                f"at most {most} connections may have a request in progress, and all have: try again shortly",
+                "overloaded",
+                {"Retry-After": "1"},
+            )
+
+    def _check_host(self, headers: Headers) -> None:
+        """Without a token a web page must not reach this server under a name of its own (DNS rebinding)."""
+        host = headers.get("host")
+        if self._tokens is None and host is not None and not names_this_machine(host):
+            raise Refusal(
+                421,
+                f"the header Host must name this machine, such as localhost, without --token-file, got {host[:80]!r}: "
+                "ask 127.0.0.1, or start the server with a token file",
+                "rejected",
+            )
 
     def _authorize(self, path: str, headers: Headers) -> None:
         if self._tokens is None or path in OPEN_PATHS:

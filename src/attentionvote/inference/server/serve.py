@@ -1,4 +1,4 @@
-"""``attentionvote serve BUNDLE|MODEL``: checks what it was given, serves, and ends in order on SIGTERM or Ctrl-C."""
+"""``attentionvote serve BUNDLE|MODEL``: checks what it was given, serves, and ends in order on a signal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import importlib.metadata
 import json
 import logging
 import os
-import signal
 import socket
 import ssl
 import sys
@@ -35,13 +34,15 @@ from attentionvote.inference.server.model.bundle_loading import BundleLoader
 from attentionvote.inference.server.model.last_known_good import STATE_VARIABLE, LastKnownGood, default_state
 from attentionvote.inference.server.model.serving import Serving
 from attentionvote.inference.server.model.source import Source, source_of
+from attentionvote.inference.server.network.book import ConnectionBook, connection_limit, raise_handle_limit
+from attentionvote.inference.server.network.listening import CellServer
 from attentionvote.inference.server.worker.process import WorkerSettings
 from attentionvote.inference.server.worker.workers import Workers
 
 PORT = 8000
-# How long requests may take to end after SIGTERM, and threads after that.
-_DRAIN_S, _THREADS_S = 10, 3.0
-_MOST_CONNECTIONS = 256
+# How long requests may take to end after SIGTERM, and threads after that: docker kills after 10 seconds.
+_DRAIN_S, _THREADS_S = 6, 1.5
+_BACKLOG = 256
 _KEEP_ALIVE_S = 75
 _MEBIBYTE = 1024 * 1024
 _MAX_DEADLINE_MS = 10_000.0
@@ -77,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serve until SIGTERM or Ctrl-C.
+    """Serve until SIGTERM, SIGHUP or Ctrl-C.
 
     Prints one JSON object with the address on stdout as soon as it listens.
 
@@ -89,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     except (InputError, BundleError) as error:
         print(f"serve: {error}", file=sys.stderr)
         return 2
-    configure()
+    configure().dropped = settings.metrics.log_lines_dropped.inc
     try:
         listener = _listen(options.host, options.port)
     except OSError as error:
@@ -182,7 +183,7 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen(_MOST_CONNECTIONS)
+        listener.listen(_BACKLOG)
     except OSError:
         listener.close()
         raise
@@ -208,17 +209,17 @@ def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.so
         say("token", f"{options.token_file} can be read by everybody on this machine: chmod 600 it", logging.WARNING)
     for warning in settings.source.warnings:
         say("registry", warning, logging.WARNING)
-    print(json.dumps({"url": url, "pid": os.getpid()}), flush=True)
     config = uvicorn.Config(
         app, loop="asyncio", http="h11", ws="none", lifespan="on", interface="asgi3",
         log_config=None, access_log=False, server_header=False, proxy_headers=False,
-        limit_concurrency=_MOST_CONNECTIONS, timeout_keep_alive=_KEEP_ALIVE_S, timeout_graceful_shutdown=_DRAIN_S,
+        timeout_keep_alive=_KEEP_ALIVE_S, timeout_graceful_shutdown=_DRAIN_S,
         ssl_certfile=options.tls_cert, ssl_keyfile=options.tls_key,
     )  # fmt: skip
-    # uvicorn raises the signal that ended it once more when it is done; an orderly end is exit code 0.
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: None)
-    uvicorn.Server(config).run(sockets=[listener])
+    most = connection_limit(raise_handle_limit(), 1 + options.queue)
+    server = CellServer(config, listener, ConnectionBook(most, metrics))
+    server.end_on_signals()
+    print(json.dumps({"url": url, "pid": os.getpid()}), flush=True)
+    server.run()
     say("end", "no request is open any more")
     _leave(settings.loader.store)
 

@@ -49,7 +49,7 @@ def test_points_are_float32_and_small_ones_survive() -> None:
 def test_outputs_default_to_all_as_json() -> None:
     asked = parse_request(*request())
     assert [tuple(output) for output in asked.outputs] == [
-        ("camera_from_part", False), ("confidence", False), ("heat", False),
+        ("camera_from_part", False), ("confidence", False), ("heat", False), ("class_index", False), ("part", False),
     ]  # fmt: skip
     assert asked.id == ""
     assert asked.deadline_ms is None
@@ -102,7 +102,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("input", {"inputs": [7]}, "an input must be a JSON object, got a number"),
     ("output", {"outputs": [{"name": "heath"}]}, "must be one of camera_from_part, .* did you mean 'heat'"),
     ("twice", {"outputs": [{"name": "heat"}] * 2}, "asked for once, got 'heat' twice"),
-    ("outputs", {"outputs": [{}] * 9}, "list of at most 3"),
+    ("outputs", {"outputs": [{}] * 9}, "list of at most 5"),
     ("flag", {"parameters": {"binary_data_output": 1}}, "must be true or false, got 1"),
     ("deadline", {"parameters": {"deadline_ms": -1}}, "deadline_ms must be a positive number of milliseconds, got -1"),
     ("timeout", {"parameters": {"timeout": "1"}}, "timeout must be a positive number of microseconds, got '1'"),
@@ -220,5 +220,5 @@ def check_parsed(body: bytes, header: str | None) -> bool:
     assert asked.points.dtype == np.float32
     assert asked.points.ndim == 2
     assert asked.points.shape[1] == 3
-    assert len(asked.outputs) <= 3
+    assert len(asked.outputs) <= 5
     return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -80,7 +81,16 @@ def test_the_stock_triton_client_sees_health_and_metadata(shared_server: Any) ->
         assert version == shared_server.version()
         assert client.is_model_ready("bracket", version)
         assert metadata["inputs"] == [{"name": "points", "datatype": "FP32", "shape": [-1, 3]}]
-        assert [o["name"] for o in metadata["outputs"]] == ["camera_from_part", "confidence", "heat"]
+        outputs = {o["name"]: (o["datatype"], o["shape"]) for o in metadata["outputs"]}
+        assert outputs == {
+            "camera_from_part": ("FP64", [-1, 4, 4]),
+            "confidence": ("FP32", [-1]),
+            "heat": ("FP32", [-1]),
+            "class_index": ("INT64", [-1]),
+            "part": ("BYTES", [-1]),
+        }
+        (part,) = metadata["parameters"]["parts"]
+        assert (part["class_index"], part["name"], part["diameter"]) == (0, "bracket", 0.1)
         assert client.get_model_repository_index() == [
             {"name": "bracket", "version": version, "state": "READY", "reason": ""}
         ]
@@ -181,10 +191,38 @@ def test_json_answers_without_binary_have_no_length_header(
     assert "Inference-Header-Content-Length" not in reply.headers
     assert reply.headers["content-type"] == "application/json"
     shapes = {output["name"]: output["shape"] for output in reply.json["outputs"]}
-    assert shapes == {"camera_from_part": [2, 4, 4], "confidence": [2], "heat": [2]}
+    assert shapes == {"camera_from_part": [2, 4, 4], "confidence": [2], "heat": [2], "class_index": [2], "part": [2]}
     body, headers = infer_body(make_cloud(), binary_data_output=True)
     reply = shared_server.post("/v2/models/bracket/infer", body, headers)
     head = json.loads(reply.body[: int(reply.headers["Inference-Header-Content-Length"])])
     sizes = [output["parameters"]["binary_data_size"] for output in head["outputs"]]
-    assert sizes == [2 * 16 * 8, 2 * 4, 2 * 4]
+    assert sizes == [2 * 16 * 8, 2 * 4, 2 * 4, 2 * 8, 2 * (4 + len("bracket"))]
     assert len(reply.body) == int(reply.headers["Inference-Header-Content-Length"]) + sum(sizes)
+
+
+def test_tritons_config_and_statistics_are_true(start_server: Any, bundle_folder: Path, make_cloud: Any) -> None:
+    server = start_server(bundle_folder)
+    with triton_client(server.address) as client:
+        config = client.get_model_config("bracket")
+        assert (config["name"], config["max_batch_size"]) == ("bracket", 0)
+        assert config["input"] == [{"name": "points", "data_type": "TYPE_FP32", "dims": [-1, 3]}]
+        assert config["output"][0] == {"name": "camera_from_part", "data_type": "TYPE_FP64", "dims": [-1, 4, 4]}
+        assert config["output"][-1] == {"name": "part", "data_type": "TYPE_STRING", "dims": [-1]}
+        (before,) = client.get_inference_statistics()["model_stats"]
+        assert (before["inference_count"], before["last_inference"]) == (0, 0)
+        for _ in range(3):
+            client.infer("bracket", [cloud_input(make_cloud(), True)])
+        with pytest.raises(triton.InferenceServerException, match="were millimetres sent"):
+            client.infer("bracket", [cloud_input(make_cloud() * 1000, True)])
+        (after,) = client.get_inference_statistics("bracket", server.version())["model_stats"]
+        assert (after["name"], after["version"]) == ("bracket", server.version())
+        assert after["inference_count"] == after["execution_count"] == 3
+        spent = after["inference_stats"]
+        counts = {key: value["count"] for key, value in spent.items()}
+        assert counts == {"success": 3, "fail": 1, "queue": 3, "compute_input": 3, "compute_infer": 3}
+        assert 0 < spent["compute_infer"]["ns"] < spent["success"]["ns"]
+        assert abs(after["last_inference"] / 1e3 - time.time()) < 60
+        for ask in (client.get_model_config, client.get_inference_statistics):
+            with pytest.raises(triton.InferenceServerException, match="got 'gear'") as caught:
+                ask("gear")
+            assert caught.value.status() == "404"

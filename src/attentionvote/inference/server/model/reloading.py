@@ -156,8 +156,12 @@ class BundleWatch:
         self._tell(sentence, trace)
 
     async def _start_from_last_known_good(self) -> None:
-        # Not in the reload thread, which may hang in the served path.
-        served, problems = await asyncio.to_thread(self._loader.last_known_good)
+        # Not in the reload thread, which may hang in the served path, nor in asyncio's, which is waited for at exit.
+        thread = ThreadPoolExecutor(1, thread_name_prefix="last known good")
+        try:
+            served, problems = await asyncio.get_running_loop().run_in_executor(thread, self._loader.last_known_good)
+        finally:
+            thread.shutdown(wait=False)
         for problem in problems:
             say("last_known_good", f"a kept copy cannot serve: {problem}", logging.ERROR)
         if served is None:

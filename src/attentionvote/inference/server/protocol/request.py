@@ -21,7 +21,9 @@ from attentionvote.inference.server.bounded_json import parse_json
 
 INPUT = "points"
 LENGTH_HEADER = "Inference-Header-Content-Length"
-OUTPUTS = {"camera_from_part": "FP64", "confidence": "FP32", "heat": "FP32"}
+OUTPUTS = {
+    "camera_from_part": "FP64", "confidence": "FP32", "heat": "FP32", "class_index": "INT64", "part": "BYTES",
+}  # fmt: skip
 _MOST_ID = 256
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict, _SHORT.maxstring, _SHORT.maxlong = 2, 6, 3, 60, 24

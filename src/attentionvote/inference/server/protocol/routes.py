@@ -15,7 +15,7 @@ from attentionvote.inference.server.bounded_json import parse_json
 from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.model.reloading import Watch
 from attentionvote.inference.server.model.serving import Served
-from attentionvote.inference.server.protocol.answer import EXTENSIONS, model_metadata
+from attentionvote.inference.server.protocol.answer import EXTENSIONS, model_config, model_metadata
 from attentionvote.inference.server.protocol.request import LENGTH_HEADER
 from attentionvote.inference.server.refusal import Refusal
 
@@ -39,10 +39,13 @@ class ProtocolRoutes:
         model, versioned = "/v2/models/{name}", "/v2/models/{name}/versions/{version}"
         return [
             Route("/v2", self._server),
+            Route("/v2/models/stats", self._statistics),
             Route("/v2/health/live", self._live),
             Route("/v2/health/ready", self._ready),
             *(Route(prefix, self._model) for prefix in (model, versioned)),
             *(Route(prefix + "/ready", self._model_ready) for prefix in (model, versioned)),
+            *(Route(prefix + "/config", self._config) for prefix in (model, versioned)),
+            *(Route(prefix + "/stats", self._statistics) for prefix in (model, versioned)),
             *(Route(prefix + "/infer", self._infer, methods=["POST"]) for prefix in (model, versioned)),
             Route("/v2/repository/index", self._index, methods=["POST"]),
             Route("/v2/repository/models/{name}/load", self._load, methods=["POST"]),
@@ -62,7 +65,14 @@ class ProtocolRoutes:
 
     async def _model(self, request: Request) -> Response:
         served = self._serving.model(**request.path_params)
-        return JSONResponse(model_metadata(served.name, served.version))
+        return JSONResponse(model_metadata(served.name, served.version, served.card))
+
+    async def _config(self, request: Request) -> Response:
+        return JSONResponse(model_config(self._serving.model(**request.path_params).name))
+
+    async def _statistics(self, request: Request) -> Response:
+        served = self._serving.model(**request.path_params)
+        return JSONResponse({"model_stats": [self._answering.tally.statistics(served.name, served.version)]})
 
     async def _model_ready(self, request: Request) -> Response:
         served = self._serving.ready(**request.path_params)

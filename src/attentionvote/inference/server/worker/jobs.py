@@ -122,7 +122,7 @@ class _Job:
         """The protocol's answer and the length of its JSON part (None: there is nothing else)."""
         digest, card = self._estimator.digest, self._estimator.card
         parameters = answer_parameters(answer, card.part.name, digest)
-        tensors = pose_tensors(answer["poses"])
+        tensors = pose_tensors(answer["poses"], card.classes)
         return encode_answer(card.part.name, answer["model"], asked.id, parameters, tensors, asked.outputs)
 
 

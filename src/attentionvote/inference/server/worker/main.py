@@ -40,8 +40,8 @@ def main(channel_handle: int, lifeline: int) -> int:
     """
     _end_with_the_server(lifeline)
     faulthandler.enable()
-    # Both reach every process of a terminal or a service; the server ends its workers itself.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    # All reach every process of a terminal or a service; the server ends its workers itself.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (_MOST_ANSWER_BYTES, _MOST_ANSWER_BYTES))

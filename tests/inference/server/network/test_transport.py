@@ -1,0 +1,79 @@
+"""The end of a connection: the client gets its answer while it is still sending, and not for ever."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from attentionvote.inference.server.network import transport
+
+
+class Inner(asyncio.Transport):
+    """A transport that writes down what is done to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.done: list[str] = []
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in ("close", "abort", "resume_reading", "write_eof"):
+            return lambda: self.done.append(name)
+        return super().__getattribute__(name)
+
+    def can_write_eof(self) -> bool:
+        return True
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+    def is_closing(self) -> bool:
+        return False
+
+
+def test_with_nothing_to_come_it_closes_at_once() -> None:
+    async def run() -> list[str]:
+        inner = Inner()
+        outer = transport.LingeringTransport(inner, lambda: False)
+        outer.close()
+        outer.close()
+        assert outer.is_closing()
+        outer.lost()
+        return inner.done
+
+    assert asyncio.run(run()) == ["close"]
+
+
+def test_with_more_to_come_it_ends_its_own_side_and_then_itself(monkeypatch: Any) -> None:
+    monkeypatch.setattr(transport, "LINGER_S", 0.05)
+
+    async def run() -> list[str]:
+        inner = Inner()
+        outer = transport.LingeringTransport(inner, lambda: True)
+        outer.close()
+        outer.drop(1000)
+        assert inner.done == ["resume_reading", "write_eof"]
+        await asyncio.sleep(0.1)
+        return inner.done
+
+    assert asyncio.run(run())[2:] == ["abort"]
+
+
+def test_more_than_a_gibibyte_is_not_waited_for() -> None:
+    async def run() -> list[str]:
+        inner = Inner()
+        outer = transport.LingeringTransport(inner, lambda: True)
+        outer.close()
+        outer.drop(1024**3)
+        assert "abort" not in inner.done
+        outer.drop(1)
+        outer.lost()
+        return inner.done
+
+    assert asyncio.run(run())[-1] == "abort"
+
+
+def test_the_answer_arrives_while_a_large_body_is_sent(shared_server: Any) -> None:
+    for _ in range(5):
+        reply = shared_server.post("/poses", b"\0" * 30_000_000)
+        assert reply.status == 413
+        assert "at most 1048576 bytes, got 30000000" in reply.error
