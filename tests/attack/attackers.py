@@ -152,11 +152,11 @@ def _png_with_two_headers() -> bytes:
 def _pcd_of_literals(size: int) -> bytes:
     points = size // 12
     head = (
-        f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
+        f"VERSION .7\nFIELDS x y z rest\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 13\nWIDTH {points}\nHEIGHT 1\n"
         f"POINTS {points}\nDATA binary_compressed\n"
     )
-    packed = b"\x00\x01" * (points * 12)
-    return head.encode() + struct.pack("<II", len(packed), points * 12) + packed
+    packed = b"\x00\x3f" * (points * 12)  # every coordinate is .747
+    return head.encode() + struct.pack("<II", len(packed), points * 25) + packed
 
 
 def stopped_workers(pid: int, stop: threading.Event, count: Counter[str], rng: random.Random) -> None:

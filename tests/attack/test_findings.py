@@ -1,7 +1,7 @@
 """What attacks on the cell have come to light, and the test of each that failed before it was mended.
 
-The numbers are those of the attack of commit bd720d7 (S1: out of service or a wrong pose; S2: starved or blind; S3 and S4:
-smaller), then what bug reports and real files have shown.
+The numbers are those of the attack of commit bd720d7 (S1: out of service or a wrong pose; S2: starved or blind; S3 and
+S4: smaller), then what bug reports and real files have shown.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""A real server and bodies that want to become large, slow or endless: the next request is answered as if nothing was."""
+"""A real server and bodies that want to become large, slow or endless: the next request is answered all the same."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import time
@@ -27,7 +28,7 @@ def bodies() -> dict[str, bytes]:
     ("name", "status", "sentence"),
     [
         ("strays", 200, ""),
-        ("half strays", 400, "points must lie within 10 m of the camera"),
+        ("half strays", 400, "points must be metres"),
         ("one place", 200, ""),
         ("subnormal", 400, "points must be metres"),
         ("four million", 200, ""),
@@ -35,7 +36,7 @@ def bodies() -> dict[str, bytes]:
         ("bzip2", 400, "the body must be a point cloud"),
         ("deflated", 400, "must unpack to at most"),
         ("two headers", 400, "must have one PNG header"),
-        ("literals", 400, "points must be metres"),
+        ("literals", 200, ""),
     ],
 )
 def test_no_body_keeps_the_next_one_waiting(
@@ -58,8 +59,6 @@ def test_no_body_keeps_the_next_one_waiting(
 def test_whatever_happens_to_the_workers_a_request_is_answered_again(
     attacked_server: Any, make_cloud: Any, npy: Any, number: int
 ) -> None:
-    import os
-
     body = npy(make_cloud())
     before = attacked_server.post("/poses", body).json["poses"]
     for worker in child_processes(attacked_server.process.pid):

@@ -106,9 +106,10 @@ class Workers:
         """Let a worker do a job; None when the deadline passed before there was one.
 
         Raises:
-            WorkerLost: the job was lost with its worker; the next one gets another.
+            WorkerLost: the job was lost with its worker, or with a second one after the first had ended in it.
             RuntimeError: when they are closed.
         """
+        crashed = False
         for _ in range(_TRIES):
             worker = self._take(deadline)
             if worker is None:
@@ -120,7 +121,10 @@ class Workers:
                 continue
             except WorkerLost as loss:
                 self._drop(worker, loss.reason, loss.detail)
-                raise
+                if loss.reason == "deadline" or crashed:
+                    raise
+                crashed = True  # perhaps by no fault of this job: a second worker tells
+                continue
             finally:
                 with self._changed:
                     self._since.pop(worker, None)
