@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Iterator
+from typing import Literal, get_args
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disable_created_metrics, generate_latest
 from prometheus_client.core import GaugeMetricFamily
@@ -19,7 +20,8 @@ SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75, 1.0, 2.0, 5
 DETECTIONS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
 RELOADS = ("loaded", "refused", "failed", "last_known_good")
 LOSSES = ("deadline", "memory", "crashed")
-CLOSED = ("silent", "head", "handshake", "answer", "chunks")
+Closed = Literal["silent", "head", "handshake", "answer", "chunks"]
+CLOSED: tuple[Closed, ...] = get_args(Closed)
 POLLS = ("answered", "away", "refused", "failed")
 
 

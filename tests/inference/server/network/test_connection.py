@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import os
 import socket
 import threading
@@ -61,7 +62,9 @@ def test_heads_that_do_not_come_and_answers_that_are_not_read_end(start_server: 
                 with suppress(OSError):
                     while time.monotonic() - begun < 20:
                         with suppress(TimeoutError):
-                            replies[name] = connection.recv(65536), time.monotonic() - begun
+                            reply = connection.recv(65536)
+                            connection.settimeout(5)
+                            replies[name] = reply + all_of(connection), time.monotonic() - begun
                             return
                         connection.sendall(drip)
             replies[name] = all_of(connection), time.monotonic() - begun
@@ -159,3 +162,16 @@ def test_what_is_no_http_gets_a_sentence(shared_server: Any) -> None:
         reply = all_of(connection)
     assert reply.startswith(b"HTTP/1.1 400 ")
     assert b'{"error":"the request must be HTTP/1.1 with a line and headers of at most 64 KiB, but it is not"}' in reply
+
+
+def test_answers_on_a_kept_connection_are_not_held_back(shared_server: Any) -> None:
+    """Head and body are two packets; without TCP_NODELAY the second waits 40 ms for the first one's receipt."""
+    connection = http.client.HTTPConnection(shared_server.address, timeout=10)
+    seconds = []
+    for _ in range(41):
+        begun = time.monotonic()
+        connection.request("GET", "/v2")
+        assert connection.getresponse().read()
+        seconds.append(time.monotonic() - begun)
+    connection.close()
+    assert sorted(seconds)[20] < 0.03

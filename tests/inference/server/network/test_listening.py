@@ -102,4 +102,4 @@ def test_without_a_file_handle_it_waits_says_so_once_and_goes_on(start_server: A
         resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
         assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
     (line,) = server.log("handles")
-    assert line["message"] == "no connection can be taken up: Too many open files; it is tried again"
+    assert line["message"] == "no connection can be taken up (Too many open files); it is tried again"

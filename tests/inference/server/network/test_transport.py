@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import time
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
+from attentionvote.inference.client.pose_client import PoseClient, Rejected
 from attentionvote.inference.server.network import transport
 
 
@@ -77,3 +85,43 @@ def test_the_answer_arrives_while_a_large_body_is_sent(shared_server: Any) -> No
         reply = shared_server.post("/poses", b"\0" * 30_000_000)
         assert reply.status == 413
         assert "at most 1048576 bytes, got 30000000" in reply.error
+
+
+def test_the_answer_arrives_over_tls_as_well(
+    start_server: Any, bundle_folder: Path, tmp_path: Path, certificate: Any
+) -> None:
+    cert, key = certificate(tmp_path)
+    options = ("--tls-cert", str(cert), "--tls-key", str(key), "--max-body-mb", "1")
+    server = start_server(bundle_folder, *options, ready=False)
+    with PoseClient(server.url, ca_file=cert, part="bracket") as client:
+        server.wait_until(client.ready, "it is ready")
+        for _ in range(3):
+            begun = time.monotonic()
+            with pytest.raises(Rejected, match="the body must have at most 1048576 bytes, got 24000"):
+                client.estimate(np.full((2_000_000, 3), 0.8, np.float32))
+            assert time.monotonic() - begun < 8
+        assert client.ready()
+
+
+@pytest.mark.slow
+def test_a_client_that_goes_on_sending_is_cut_off(shared_server: Any) -> None:
+    host, port = shared_server.address.split(":")
+    begun = time.monotonic()
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(b"POST /pose HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n")
+        with suppress(OSError):
+            while time.monotonic() - begun < 20:
+                connection.sendall(b"x")
+                time.sleep(0.2)
+    assert 9 < time.monotonic() - begun < 15
+
+
+def test_the_server_s_end_does_not_wait_for_what_is_dropped(start_server: Any, bundle_folder: Path) -> None:
+    server = start_server(bundle_folder)
+    host, port = server.address.split(":")
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(b"POST /pose HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n")
+        assert connection.recv(12) == b"HTTP/1.1 404"
+        begun = time.monotonic()
+        assert server.stop() == 0
+        assert time.monotonic() - begun < 4

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import resource
 import time
-from typing import Literal, Protocol
+from typing import Protocol
 
 from attentionvote.inference.server.json_logs import say
-from attentionvote.inference.server.metrics import Metrics
+from attentionvote.inference.server.metrics import Closed, Metrics
 
 HEALTH_CONNECTIONS = 8
 _MOST_CONNECTIONS, _FEWEST_CONNECTIONS = 256, 8
@@ -17,8 +17,6 @@ _MOST_HANDLES = 4096
 # and the files of that bundle.
 _RESERVED_HANDLES = 56
 _SAY_AGAIN_S = 60.0
-
-Closed = Literal["silent", "head", "handshake", "answer", "chunks"]
 
 
 class Entry(Protocol):

@@ -104,8 +104,9 @@ class CellConnection(H11Protocol):
         """The server ends: so does the connection, after the request in progress."""
         if self.busy:
             super().shutdown()
-        else:
-            self.transport.close()
+        elif self._lingering is not None:
+            self._lingering.hurry()
+            self._lingering.close()
 
     def pause_writing(self) -> None:
         """The client does not read its answer."""

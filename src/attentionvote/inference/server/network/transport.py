@@ -44,6 +44,11 @@ class LingeringTransport(asyncio.Transport):
             except OSError:  # the client has left already
                 self._inner.abort()
 
+    def hurry(self) -> None:
+        """End now, where the answer was sent: the server ends."""
+        if self._closing and not self._inner.get_write_buffer_size():
+            self._inner.abort()
+
     def drop(self, size: int) -> None:
         """Bytes came that nobody reads."""
         self._dropped_bytes += size
