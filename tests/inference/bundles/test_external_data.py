@@ -132,7 +132,9 @@ def test_the_runtime_would_have_read_the_file(tmp_path: Path, monkeypatch: pytes
     output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [4])
     graph = helper.make_graph([helper.make_node("Identity", ["secret"], ["y"])], "g", [], [output], [outside()])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10).SerializeToString()
-    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     assert session.run(None, {})[0].tolist() == [7, 7, 7, 7]
     assert external_tensor(model) == "secret"
 
