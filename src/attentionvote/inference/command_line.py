@@ -34,6 +34,16 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}: see {self.prog} --help\n")
 
 
+class _Version(argparse.Action):
+    """Prints the installed version; looked up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        import importlib.metadata
+
+        print(f"{parser.prog} {importlib.metadata.version('attentionvote')}")
+        parser.exit(OK)
+
+
 def main(words: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave the process."""
     words = list(sys.argv[1:] if words is None else words)
@@ -69,6 +79,7 @@ def _say(message: object) -> None:
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """The parser; the server's options are looked up only where they are asked for."""
     parser = _Parser(prog="attentionvote", description="6D poses of parts in a bin, from a signed model bundle.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="say the version and end")
     verbs = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
 
     verb = verbs.add_parser("estimate", help="poses in one cloud or depth image", description=_estimate.__doc__)
