@@ -1,6 +1,7 @@
 """Open the tracked runs in a browser: ``make ui``, or ``python pipelines/ui.py [--store sqlite:///X.db] [--port N]``.
 
-Serves the store on a free loopback port until Ctrl-C or SIGTERM; the server never outlives the script. A store that is a server already is only named.
+Serves the store on a free loopback port until Ctrl-C or SIGTERM; the server never outlives the script. A store that is
+a server already is only named.
 Standard output: one JSON object with the address, as soon as it answers.
 """
 
