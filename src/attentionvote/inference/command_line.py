@@ -1,4 +1,4 @@
-"""``attentionvote`` on a cell's command line: estimate a file, verify a bundle, fetch one, serve it, make keys.
+"""``attentionvote`` on a cell's command line: estimate a file, verify, fetch or serve a bundle, make keys, read on.
 
 Results go to stdout, everything else to stderr as one sentence. Exit codes: 0 done, 1 the bundle or the machine is at
 fault, 2 the input or the command is, 130 interrupted. Heavy imports stand where they are used: ``--help`` is instant.
@@ -119,6 +119,13 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
         fetch_command.add_arguments(verb)
         verb.set_defaults(run=fetch_command.run)
+
+    verb = verbs.add_parser("docs", help="the operator's pages", description="List the pages, or print one.")
+    if words[:1] == ["docs"]:
+        from attentionvote.inference import documentation
+
+        documentation.add_arguments(verb)
+        verb.set_defaults(run=documentation.run)
 
     verb = verbs.add_parser("keys", help="make the key pair that signs bundles", description=_keys.__doc__)
     verb.add_argument("--folder", metavar="PATH", help="default: $ATTENTIONVOTE_KEYS or ~/.config/attentionvote")
