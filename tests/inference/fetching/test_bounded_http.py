@@ -23,6 +23,7 @@ from attentionvote.inference.fetching.bundles import FetchedBundles
 from attentionvote.inference.fetching.reference import RegistryVersion, parse_reference
 from attentionvote.inference.fetching.registry import Registry
 from attentionvote.inference.server.metrics import Metrics
+from attentionvote.inference.server.model import following as following_module
 from attentionvote.inference.server.model.bundle_loading import BundleLoader
 from attentionvote.inference.server.model.following import Following
 from attentionvote.inference.server.model.reloading import BundleWatch
@@ -197,25 +198,33 @@ def test_a_quick_answer_is_read_whole(drip: Callable[..., DrippingServer]) -> No
 
 
 def test_a_dripping_registry_is_a_failing_one_for_the_metrics(
-    drip: Callable[..., DrippingServer], trusted_key: Path, tmp_path: Path
+    drip: Callable[..., DrippingServer], trusted_key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Before its time is over, and after."""
     server = drip(*CASES["trailers"])
     registry = Registry(Access(f"http://127.0.0.1:{server.port}"))
     key = load_public_key(trusted_key)
 
-    async def ask() -> tuple[str | None, bytes]:
+    monkeypatch.setattr(following_module, "_SLOW_S", 0.3)
+
+    async def ask() -> tuple[str | None, str, str]:
         metrics = Metrics()
         serving = Serving(metrics)
         bundles = FetchedBundles(tmp_path / "registry", parse_reference("models:/gear@champion"), key)
         loader = BundleLoader(key, lambda bundle, _: Workers(bundle, WorkerSettings()), None)
         watch = BundleWatch(bundles.link, loader, serving, metrics)
         following = Following(registry, bundles, watch, serving, metrics)
-        problem = await following.check()
+        check = asyncio.ensure_future(following.check())
+        await asyncio.sleep(0.6)
+        meanwhile = metrics.text().decode()
+        problem = await check
         following.close()
         serving.close()
-        return problem, metrics.text()
+        return problem, meanwhile, metrics.text().decode()
 
-    problem, text = asyncio.run(asyncio.wait_for(ask(), 10))
+    problem, meanwhile, after = asyncio.run(asyncio.wait_for(ask(), 10))
     assert problem is not None
     assert "cannot be reached" in problem
-    assert b"attentionvote_registry_failing 1.0" in text
+    assert "attentionvote_registry_failing 1.0" in meanwhile
+    assert "models:/gear@champion has been asked for or fetched for 0.3 s, and it is not over" in meanwhile
+    assert "attentionvote_registry_failing 1.0" in after
