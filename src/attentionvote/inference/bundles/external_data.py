@@ -24,11 +24,12 @@ _MESSAGES: dict[str, dict[int, str]] = {
     "sparse_tensor": {1: "tensor", 2: "tensor"},
     "tensor": {13: _OUTSIDE, 14: _OUTSIDE},
 }
-# What a tag of such a field begins with, however long it is written: most nodes and attributes have no such byte
-# and need not be read, which saves a quarter of the time.
+# What the tags of such fields begin with, however long they are written. Most nodes and attributes have no such bytes and
+# need not be read, which saves a third of the time.
+_OUTSIDE_TAG = re.compile(rb"[\x6a\xea\x70\xf0]")
 _TAGS = {
-    "node": re.compile(rb"[\x2a\xaa]"),
-    "attribute": re.compile(rb"[\x2a\xaa\x32\xb2\x52\xd2\x5a\xda\xba]"),
+    "node": (re.compile(rb"[\x2a\xaa]"), _OUTSIDE_TAG),
+    "attribute": (re.compile(rb"[\x2a\xaa\x32\xb2\x52\xd2\x5a\xda\xba]"), _OUTSIDE_TAG),
 }
 _MOST_DEPTH = 100  # of messages in messages, as the runtime's own reader has it
 _MOST_FIELDS = 1_000_000  # the connecting rod's graph has some thousands
@@ -60,7 +61,7 @@ def external_tensor(model: bytes) -> str | None:
             if kind == _OUTSIDE:
                 if wire == BYTES or any(byte & 0x7F for byte in model[first:last]):
                     return _name(model, start, end)
-            elif wire == BYTES and (kind not in _TAGS or _TAGS[kind].search(model, first, last)):
+            elif wire == BYTES and all(tag.search(model, first, last) for tag in _TAGS.get(kind, ())):
                 pending.append((kind, first, last, depth + 1))
     return None
 
