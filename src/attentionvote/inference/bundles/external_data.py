@@ -24,8 +24,8 @@ _MESSAGES: dict[str, dict[int, str]] = {
     "sparse_tensor": {1: "tensor", 2: "tensor"},
     "tensor": {13: _OUTSIDE, 14: _OUTSIDE},
 }
-# What the tags of such fields begin with, however long they are written. Most nodes and attributes have no such bytes and
-# need not be read, which saves a third of the time.
+# What the tags of such fields begin with, however long they are written. Most nodes and attributes have no such bytes
+# and need not be read, which saves a third of the time.
 _OUTSIDE_TAG = re.compile(rb"[\x6a\xea\x70\xf0]")
 _TAGS = {
     "node": (re.compile(rb"[\x2a\xaa]"), _OUTSIDE_TAG),
