@@ -24,8 +24,8 @@ make_root() {
 }
 make_root >"$work/log" 2>&1 || { tail -n 5 "$work/log" "$root/debootstrap/debootstrap.log" >&2; exit 1; }
 
-(cd "$root" && rm -rf debootstrap etc/resolv.conf etc/hostname var/lib/apt/lists/* var/log/* var/cache/debconf/*-old \
-    usr/share/doc/* usr/share/man/* usr/share/info/* usr/share/locale/*)
+(cd "$root" && find usr/share/doc -mindepth 2 ! -type d ! -name copyright -delete && rm -rf debootstrap etc/resolv.conf etc/hostname var/lib/apt/lists/* var/log/* var/cache/debconf/*-old \
+    usr/share/man/* usr/share/info/* usr/share/locale/*)
 container=$(buildah from scratch)
 buildah copy -q "$container" "$root" / >/dev/null
 buildah commit -q --rm "$container" "$image" >/dev/null

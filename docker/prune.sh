@@ -55,7 +55,10 @@ system() {
     done
     # Tables of iconv(); Python brings its own codecs.
     rm -rf /usr/lib/*-linux-gnu/gconv
-    rm -rf /usr/share/doc /usr/share/man /usr/share/info /usr/share/locale /usr/share/lintian /usr/share/gcc \
+    # Documentation, but the copyright notices that Debian's packages are passed on with.
+    find /usr/share/doc -mindepth 2 ! -type d ! -name copyright -delete
+    find /usr/share/doc -mindepth 1 -type d -empty -delete
+    rm -rf /usr/share/man /usr/share/info /usr/share/locale /usr/share/lintian /usr/share/gcc \
         /var/cache/* /var/lib/apt /etc/apt /var/log/* /root/.cache
     # No program gives anybody more rights than he has.
     find / -xdev -type f -perm /6000 -exec chmod a-s {} +

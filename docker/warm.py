@@ -1,4 +1,5 @@
-"""What the read-only image cannot make at its first start: compiled C operators and bytecode. Run while it is built.
+"""What a cell cannot make at its first start: compiled C operators, and the read-only image's bytecode. Run while it is
+built, or installed (docs/operating-a-cell.md).
 
 Python images ship no bytecode. Without it every start compiles the sources again (4 s instead of 0.9 s for the
 imports alone), and so does every health check; bytecode of everything would be 50 MB instead of 15.
@@ -34,14 +35,16 @@ LATE = (
 
 
 def main() -> None:
-    """Compile into ``ATTENTIONVOTE_CACHE`` and ``PYTHONPYCACHEPREFIX``.
+    """Compile into ``ATTENTIONVOTE_CACHE`` and, where it is set, ``PYTHONPYCACHEPREFIX``.
 
     The bytecode is not compared with its source's date: copies between layers change dates, and nothing changes in a
-    read-only image.
+    read-only image. Elsewhere sources change, and pip and Debian make their own.
     """
     for package, file in FILES:
         if native.load(package, file) is None:
             sys.exit(f"warm: {file} was not compiled")
+    if sys.pycache_prefix is None:
+        return
     for module in pkgutil.walk_packages(attentionvote.inference.__path__, "attentionvote.inference."):
         importlib.import_module(module.name)
     for name in LATE:

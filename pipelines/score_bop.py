@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,11 @@ from attentionvote.evaluation.bop_files import (
     read_truth,
 )
 from attentionvote.evaluation.bop_scores import LENGTHS_MM, RESULT_LIMIT, RESULT_LIMITS, SHARES, bop_scores, selected
+from attentionvote.inference.scans.limits import Budget
 from attentionvote.inference.scans.ply_file import points_from_ply
 
 log = logging.getLogger("attentionvote.score")
-MOST_VERTICES = 10_000_000
+MOST_VERTEX_BYTES = 1024 * 1024 * 1024
 
 
 def scored(cfg: DictConfig) -> dict[str, Any]:
@@ -85,7 +87,9 @@ def _vertices(folder: Path, number: int) -> np.ndarray:
     """Vertices ``(V, 3)`` in metres of a model; BOP's files are in millimetres."""
     path = folder / f"obj_{number:06d}.ply"
     try:
-        return points_from_ply(path.read_bytes(), MOST_VERTICES).astype(np.float64) / 1000
+        vertices = points_from_ply(memoryview(path.read_bytes()), Budget(MOST_VERTEX_BYTES, math.inf))
+        # For a scan a point at the origin is a missing one; a model may have a vertex there.
+        return np.nan_to_num(vertices.astype(np.float64), nan=0.0) / 1000
     except OSError as error:
         raise ValueError(f"{path}: the model cannot be read ({error.strerror})") from error
     except ValueError as error:

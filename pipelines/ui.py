@@ -1,6 +1,7 @@
 """Open the tracked runs in a browser: ``make ui``, or ``python pipelines/ui.py [--store sqlite:///X.db] [--port N]``.
 
-Serves the store on a free loopback port until Ctrl-C. A store that is a server already is only named.
+Serves the store on a free loopback port until Ctrl-C or SIGTERM; the server never outlives the script. A store that is
+a server already is only named.
 Standard output: one JSON object with the address, as soon as it answers.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 
 from attentionvote.tracking.server import serve
@@ -19,6 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--store", help="default: MLFLOW_TRACKING_URI, else outputs/mlflow.db")
     parser.add_argument("--port", type=int, default=0, help="default: a free one")
     options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         store = resolve_store(options.store)
         if is_server(store):
@@ -39,6 +42,11 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+
+
+def _interrupt(*_: object) -> None:
+    """End as Ctrl-C does: `kill`, and `make` that was killed, send SIGTERM."""
+    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -33,6 +33,11 @@ def test_a_container_may_do_no_more_than_it_must(compose: dict[str, Any], name: 
     assert service["security_opt"] == ["no-new-privileges:true"]
     assert service["pids_limit"] <= 256
     assert service["mem_limit"] in ("2g", "3g", "4g")
+    # Signals reach a process that has no handler for them yet, and no log fills the disk.
+    assert service["init"] is True
+    logs = service["logging"]
+    assert logs["driver"] == "json-file"
+    assert (logs["options"]["max-size"], int(logs["options"]["max-file"])) == ("10m", 5)
     assert not {"privileged", "cap_add", "network_mode", "pid", "devices"} & set(service)
     # Our images name their user; PostgreSQL's would start as root.
     assert service.get("user") == ("999:999" if name == "postgres" else None)
@@ -60,13 +65,33 @@ def test_only_the_state_can_be_written(compose: dict[str, Any], stages: dict[str
     service, image = compose["services"]["inference"], stages["inference"]
     volumes = {entry.rsplit(":", 1)[-1] if not entry.endswith(":ro") else entry for entry in service["volumes"]}
     assert volumes == {"/state", "${CELL_BUNDLES:-./cell/bundles}:/bundles:ro"}
-    assert set(service["secrets"]) == {"token", "signing.pub", "registry"}
+    assert set(service["secrets"]) == {"token", "signing.pub", "registry", "tls.crt", "tls.key"}
     words = image["CMD"]
     given = dict(zip(words[2::2], words[3::2], strict=True))
     assert words[:2] == ["serve", "/bundles/latest"]
     assert given["--state"] == image["VOLUME"] == "/state"
     assert (given["--token-file"], given["--key"]) == ("/run/secrets/token", "/run/secrets/signing.pub")
     assert compose["services"]["mlflow"]["volumes"] == ["mlflow:/data"]
+
+
+def test_the_cell_has_the_time_to_end_in_order(compose: dict[str, Any]) -> None:
+    (seconds,) = re.findall(r"^(\d+)s$", compose["services"]["inference"]["stop_grace_period"])
+    assert int(seconds) > serve._DRAIN_S + serve._THREADS_S
+
+
+def test_tls_is_two_files(compose: dict[str, Any], interpolate: Callable[..., str]) -> None:
+    """The health check needs nothing for it: the server says itself where it is."""
+    command, secrets = compose["services"]["inference"]["command"], compose["secrets"]
+    files = {"CELL_TLS_CERT": "cell/tls.crt", "CELL_TLS_KEY": "cell/tls.key"}
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    plain = parser.parse_args(shlex.split(interpolate(command))[1:])
+    assert (plain.tls_cert, plain.tls_key) == (None, None)
+    options = parser.parse_args(shlex.split(interpolate(command, **files))[1:])
+    for name, option in (("tls.crt", options.tls_cert), ("tls.key", options.tls_key)):
+        assert str(option) == f"/run/secrets/{name}"
+        assert interpolate(secrets[name]["file"]) == "/dev/null"
+        assert interpolate(secrets[name]["file"], **files) == f"cell/{name}"
 
 
 def test_the_cell_serves_its_folder_until_it_is_told_to_follow_a_registry(

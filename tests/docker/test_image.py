@@ -132,12 +132,12 @@ def test_the_server_answers_as_nobody_on_a_read_only_root(
         os.chown(path, USER, USER)
     mounts = [f"{cell.bundles}:/bundles:ro", f"{secrets}:/run/secrets:ro", f"{state}:/state", f"{scratch}:/tmp"]
     start = ["buildah", "run", *(word for mount in mounts for word in ("--volume", mount)), container.name, "--"]
-    health = [*image["Healthcheck"]["Test"][1:], "--url", f"http://127.0.0.1:{free_port}"]
+    health = image["Healthcheck"]["Test"][1:]
     command = [str(free_port) if word == "8000" else word for word in (*image["Entrypoint"], *image["Cmd"])]
     command[command.index("0.0.0.0")] = "127.0.0.1"
 
     with pytest.raises(OSError, match="cannot be reached"):
-        tools.run(*start, *health)
+        tools.run(*start, *health, "--url", f"http://127.0.0.1:{free_port}")
     (container.root / "run" / ".containerenv").touch()  # buildah's own mount point, before the root is closed
     before = container.files()
     read_only(container, True)
@@ -177,7 +177,23 @@ def test_the_server_answers_as_nobody_on_a_read_only_root(
         read_only(container, False)
     assert container.files() == before, "something was written outside /state and /tmp"
     assert list(state.iterdir()), "the bundle was not kept for the next start"
-    assert not list(scratch.iterdir()), "something was written below the home folder"
+    left = [path for path in scratch.rglob("*") if not path.is_dir()]
+    assert not left, "something was left below the home folder"
+
+
+def test_debians_copyright_notices_stay(container: Container) -> None:
+    notices = [path for path in (container.root / "usr" / "share" / "doc").rglob("*") if not path.is_dir()]
+    assert {path.name for path in notices} == {"copyright"}
+    assert {"libc6", "libssl3", "zlib1g"} <= {path.parent.name for path in notices}
+    size = sum(path.lstat().st_size for path in notices)
+    print(f"image: copyright notices of {len(notices)} packages, {size / 1e6:.1f} MB")
+    assert size < 5e6
+
+
+def test_the_operators_pages_are_in_the_image(tools: Tools, container: Container) -> None:
+    for words in (["docs", "operating-a-cell"], ["--version"]):
+        text = tools.run("buildah", "run", container.name, "--", "attentionvote", *words)
+        assert text.startswith("# Operating a cell\n" if words[0] == "docs" else "attentionvote ")
 
 
 def test_the_point_operators_need_no_compiler(tools: Tools, container: Container, stages: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import resource
@@ -288,6 +289,15 @@ def test_help_is_instant(words: list[str]) -> None:
     assert done.stderr == ""
     assert "usage: attentionvote" in done.stdout
     assert after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime < 1
+
+
+def test_the_version_is_the_installed_one_and_instant() -> None:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([PROGRAM, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    version = importlib.metadata.version("attentionvote")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"attentionvote {version}\n", "")
+    assert after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime < 0.5
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -1,10 +1,12 @@
 """A real MLflow server on the loopback interface: what `make ui` starts, and what a team logs to."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 from pathlib import Path
 
@@ -77,6 +79,69 @@ def test_ui_prints_one_json_line_without_the_password_and_ends_on_interrupt(repo
     assert "swordfish" not in line + said
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(answer["url"] + "/health", timeout=5)
+
+
+@pytest.fixture
+def make_ui(repository, put_tables, tmp_path):
+    """Starts the script or `make ui` on a store, waits for its answer; process, address and store.
+
+    The Makefile's set-up is taken as done, with the Python that runs the tests.
+    """
+    store = put_tables(tmp_path / "mlflow.db")
+    environment = {**os.environ, "MLFLOW_TRACKING_URI": store}
+    processes = []
+
+    def start(by_make):
+        words = [sys.executable, str(repository / "pipelines/ui.py")]
+        if by_make:
+            words = ["make", "-s", "-C", str(repository), "ui", f"PY={sys.executable}", "STAMP=pyproject.toml"]
+        processes.append(
+            subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment)
+        )
+        url = json.loads(processes[-1].stdout.readline())["url"]
+        return processes[-1], url, store.removeprefix("sqlite:///")
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait(30)
+        process.stdout.close()
+
+
+def holders(file):
+    """Process numbers of those who have a file open."""
+    numbers = set()
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        with contextlib.suppress(OSError):
+            if os.readlink(link).startswith(str(file)):
+                numbers.add(int(link.parts[2]))
+    return numbers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("by_make", "number"), [(False, signal.SIGTERM), (False, signal.SIGKILL), (True, signal.SIGTERM)]
+)
+def test_kill_of_the_starter_ends_the_server_and_its_hold_on_the_database(make_ui, by_make, number):
+    process, url, database = make_ui(by_make)
+    port = url.rpartition(":")[2]
+
+    def server_processes():
+        return [line for path in Path("/proc").glob("[0-9]*") if f"--port\0{port}" in (line := _command_line(path))]
+
+    with urllib.request.urlopen(url + "/health", timeout=10) as reply:
+        assert reply.read() == b"OK"
+    assert server_processes()
+    process.send_signal(number)
+    process.wait(30)
+    until = time.monotonic() + 20
+    while server_processes() or holders(database):
+        assert time.monotonic() < until, (server_processes(), holders(database))
+        time.sleep(0.1)
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(url + "/health", timeout=5)
+    if not by_make and number == signal.SIGTERM:
+        assert process.returncode == 0
 
 
 def _command_line(process):

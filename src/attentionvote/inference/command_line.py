@@ -1,4 +1,4 @@
-"""``attentionvote`` on a cell's command line: estimate a file, verify a bundle, fetch one, serve it, make keys.
+"""``attentionvote`` on a cell's command line: estimate a file, verify, fetch or serve a bundle, make keys, read on.
 
 Results go to stdout, everything else to stderr as one sentence. Exit codes: 0 done, 1 the bundle or the machine is at
 fault, 2 the input or the command is, 130 interrupted. Heavy imports stand where they are used: ``--help`` is instant.
@@ -32,6 +32,16 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {message}: see {self.prog} --help\n")
+
+
+class _Version(argparse.Action):
+    """Prints the installed version; looked up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        import importlib.metadata
+
+        print(f"{parser.prog} {importlib.metadata.version('attentionvote')}")
+        parser.exit(OK)
 
 
 def main(words: Sequence[str] | None = None) -> NoReturn:
@@ -69,6 +79,7 @@ def _say(message: object) -> None:
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """The parser; the server's options are looked up only where they are asked for."""
     parser = _Parser(prog="attentionvote", description="6D poses of parts in a bin, from a signed model bundle.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="say the version and end")
     verbs = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
 
     verb = verbs.add_parser("estimate", help="poses in one cloud or depth image", description=_estimate.__doc__)
@@ -108,6 +119,13 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
         fetch_command.add_arguments(verb)
         verb.set_defaults(run=fetch_command.run)
+
+    verb = verbs.add_parser("docs", help="the operator's pages", description="List the pages, or print one.")
+    if words[:1] == ["docs"]:
+        from attentionvote.inference import documentation
+
+        documentation.add_arguments(verb)
+        verb.set_defaults(run=documentation.run)
 
     verb = verbs.add_parser("keys", help="make the key pair that signs bundles", description=_keys.__doc__)
     verb.add_argument("--folder", metavar="PATH", help="default: $ATTENTIONVOTE_KEYS or ~/.config/attentionvote")

@@ -17,6 +17,16 @@ from dataclasses import dataclass
 
 from attentionvote.tracking.store import artifact_root, connect, is_server, quiet_environment, resolve_store
 
+# Run before the server's own program, in its process: the kernel ends it when whoever started it is gone, however that
+# ended; MLflow hands the signal on to its child. 1 is PR_SET_PDEATHSIG, which outlives exec.
+_WITH_STARTER = """
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+if os.getppid() != int(sys.argv[1]):
+    sys.exit("whoever started it has gone")
+os.execv(sys.executable, [sys.executable, *sys.argv[2:]])
+"""
+
 
 @dataclass(frozen=True)
 class Server:
@@ -36,7 +46,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def serve(store: str | None = None, port: int = 0, timeout_s: float = 180.0) -> Iterator[Server]:
-    """Serve a store until the block ends.
+    """Serve a store until the block ends, or the thread that entered it.
 
     Args:
         store: see :func:`attentionvote.tracking.store.resolve_store`; not itself a server.
@@ -59,7 +69,8 @@ def serve(store: str | None = None, port: int = 0, timeout_s: float = 180.0) -> 
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     environment.pop("MLFLOW_TRACKING_URI", None)
     environment["MLFLOW_BACKEND_STORE_URI"] = uri  # not an argument: it may hold a password, and `ps` shows those
-    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    command = [sys.executable, "-S", "-c", _WITH_STARTER, str(os.getpid())]
+    command += ["-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     command += ["--artifacts-destination", root.as_uri()]
     url = f"http://127.0.0.1:{port}"
     with tempfile.TemporaryFile() as output:

@@ -123,7 +123,7 @@ def test_a_body_without_length_is_cut_off_at_the_limit(shared_server: Any) -> No
         ("POST", "/pose", 404, "got '/pose', did you mean '/poses'?"),
         ("GET", "/v2/", 404, "did you mean '/v2'?"),
         ("GET", "/v2/models/bracket/metadata/x", 404, "the path must be one that is served here"),
-        ("GET", "/qqqqqq", 404, "got '/qqqqqq', see docs/operating-a-cell.md"),
+        ("GET", "/qqqqqq", 404, "got '/qqqqqq', see `attentionvote docs operating-a-cell`"),
         ("POST", "/poses?x=1", 400, "the body must hold a cloud"),
     ],
 )
@@ -148,7 +148,7 @@ def test_the_front_page_says_what_is_served(shared_server: Any) -> None:
     content = shared_server.get("/").json
     assert content["model"]["version"] == shared_server.version()
     assert content["model"]["part"]["box"] == [[-0.05, -0.02, -0.01], [0.05, 0.02, 0.01]]
-    assert content["documentation"] == "docs/operating-a-cell.md"
+    assert content["documentation"] == "attentionvote docs operating-a-cell"
     for path in ("/poses", "/metrics", "/v2/models/MODEL/infer"):
         assert path in content["endpoints"]
 

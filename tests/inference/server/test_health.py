@@ -42,6 +42,42 @@ def test_not_ready_says_why(start_server: Any, tmp_path: Path, capsys: pytest.Ca
     assert "cannot be reached: [Errno 111] Connection refused" in capsys.readouterr().err
 
 
+def test_the_running_server_is_found_whatever_its_port_and_tls(
+    start_server: Any, bundle_folder: Path, certificate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(health, "URL", "http://127.0.0.1:1")
+    cert, key = certificate(tmp_path)
+    (tmp_path / "token").write_text("correct-horse-battery")
+    options = ("--host", "0.0.0.0", "--tls-cert", str(cert), "--tls-key", str(key))
+    server = start_server(bundle_folder, *options, "--token-file", str(tmp_path / "token"), ready=False)
+    server.wait_until(lambda: health.main([]) == 0, "it is healthy without an address")
+    assert server.stop() == 0
+    assert health.main([]) == 1
+    assert not list(tmp_path.glob("attentionvote-*/*"))
+
+
+def test_a_dead_server_is_not_asked_and_several_are_told_apart(
+    start_server: Any,
+    bundle_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(health, "URL", "http://127.0.0.1:1")
+    first, second = start_server(bundle_folder), start_server(bundle_folder)
+    assert health.main([]) == 2
+    urls = sorted([first.url, second.url])
+    sentence = "--url must say which server is asked where several run, got none: one of " + ", ".join(urls)
+    assert sentence in capsys.readouterr().err
+    first.kill()
+    assert health.main([]) == 0
+    second.kill()
+    assert health.main([]) == 1
+    assert "http://127.0.0.1:1/v2/health/ready cannot be reached" in capsys.readouterr().err
+
+
 class Stranger(http.server.BaseHTTPRequestHandler):
     """Some other server."""
 

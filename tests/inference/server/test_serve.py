@@ -166,6 +166,26 @@ def test_tls_and_token_end_to_end(
         client.estimate(make_cloud())
 
 
+def test_tokens_in_clear_are_warned_of_once(
+    start_server: Any, bundle_folder: Path, certificate: Any, tmp_path: Path
+) -> None:
+    cert, key = certificate(tmp_path)
+    token = tmp_path / "token"
+    token.write_text("correct-horse-battery")
+    token.chmod(0o600)
+    everywhere = ("--token-file", str(token), "--host", "0.0.0.0")
+    for options, count in (
+        (everywhere, 1),
+        ((*everywhere, "--tls-cert", str(cert), "--tls-key", str(key)), 0),
+        (("--token-file", str(token)), 0),
+    ):
+        server = start_server(bundle_folder, *options, ready=False)
+        server.wait_until(lambda server=server: server.log("model") != [], "it serves")
+        warnings = [line for line in server.log("token") if line["level"] == "warning"]
+        assert len(warnings) == count, options
+        assert all("tokens cross the network unencrypted: give --tls-cert" in line["message"] for line in warnings)
+
+
 def test_the_server_imports_no_training_stack_and_leaves_nothing_at_home(
     make_bundle: Any, trusted_key: Path, make_cloud: Any, npy: Any, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
 from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.inference.bundles.external_data import external_tensor
 from attentionvote.inference.bundles.graph_card import card_text
 from attentionvote.inference.bundles.manifest import (
     CARD,
@@ -144,9 +145,14 @@ def _card(folder: Path, content: bytes, model: bytes) -> ModelCard:
     except (ValueError, TypeError) as error:  # TypeError: arguments that no symmetry has
         raise BundleError(f"{folder}: {CARD}: {error}") from error
     try:
-        inside = card_text(model)
+        inside, outside = card_text(model), external_tensor(model)
     except ValueError as error:
         raise BundleError(f"{folder}: {MODEL} must be an ONNX file, but {error}: export the bundle again") from error
+    if outside is not None:
+        raise BundleError(
+            f"{folder}: {MODEL} must hold the numbers of all its tensors, but tensor {outside!r} names a file outside: "
+            "export the bundle again, with the data inside"
+        )
     if inside is None:
         raise BundleError(f"{folder}: {MODEL} must carry its card, but it carries none: export the bundle again")
     if inside != card.core().to_json():

@@ -23,6 +23,7 @@ from typing import IO, Any
 
 from attentionvote.inference.errors import BundleError, RegistryError
 from attentionvote.inference.fetching.access import Access
+from attentionvote.inference.fetching.bounded_http import Exchange, handlers
 from attentionvote.inference.fetching.reference import Reference, RegistryVersion
 
 DIGEST_TAG = "bundle.digest"
@@ -30,7 +31,7 @@ _API = "/api/2.0/mlflow/"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _MOST_JSON_BYTES, _MOST_ERROR_BYTES = 4 * 1024 * 1024, 64 * 1024
 _CHUNK_BYTES = 256 * 1024
-# A file may take this long and what its size adds: one that drips byte by byte must not hold the cell for ever.
+# An exchange may take this long and what its size adds: one that drips byte by byte must not hold the cell for ever.
 _LONGEST_ANSWER_S, _SLOWEST_BYTES_PER_S = 30.0, 64 * 1024
 _MOST_NAMED = 8
 
@@ -60,7 +61,7 @@ class Registry:
 
     Args:
         access: its address, and who asks.
-        timeout_s: longest wait for a connection and for the next bytes.
+        timeout_s: longest wait for a connection and for the next bytes; an exchange as a whole is bounded as well.
     """
 
     def __init__(self, access: Access, timeout_s: float = 10.0) -> None:
@@ -69,10 +70,7 @@ class Registry:
         self._headers = {"Accept-Encoding": "identity", "User-Agent": "attentionvote"}
         if access.authorization is not None:
             self._headers["Authorization"] = access.authorization
-        tls = ssl.create_default_context()
-        self._opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), urllib.request.HTTPSHandler(context=tls), _SameHost()
-        )
+        self._tls = ssl.create_default_context()
         self._closed = threading.Event()
 
     def close(self) -> None:
@@ -156,18 +154,19 @@ class Registry:
             _Absent: the registry says that there is no such thing.
             OverflowError: more than ``most`` bytes.
         """
-        end = time.monotonic() + longest_s
+        exchange = Exchange(time.monotonic() + longest_s, self._timeout_s, self._closed)
+        opener = urllib.request.build_opener(
+            urllib.request.ProxyHandler({}), *handlers(exchange, self._tls), _SameHost()
+        )
         request = urllib.request.Request(f"{self.url}{path}?{urllib.parse.urlencode(query)}", headers=self._headers)
         try:
-            with closing(self._opener.open(request, timeout=self._timeout_s)) as response:
+            with closing(opener.open(request)) as response:
                 count = 0
                 while piece := response.read1(_CHUNK_BYTES):
                     count += len(piece)
                     if count > most:
                         raise OverflowError
                     yield piece
-                    if time.monotonic() > end or self._closed.is_set():
-                        raise TimeoutError("the answer takes too long")
                 if response.length:  # what its header promised and did not come
                     raise http.client.IncompleteRead(b"", response.length)
         except urllib.error.HTTPError as error:

@@ -28,7 +28,7 @@ from attentionvote.inference.server.protocol.routes import ProtocolRoutes, regis
 from attentionvote.inference.server.refusal import Refusal, bad_request
 from attentionvote.inference.server.request_log import RequestLog
 
-DOCUMENTATION = "docs/operating-a-cell.md"
+DOCUMENTATION = "attentionvote docs operating-a-cell"  # a command: the cell has it, the repository it has not
 _PATHS = (
     "/poses", "/metrics", "/v2", "/v2/health/live", "/v2/health/ready", "/v2/models/MODEL", "/v2/models/MODEL/infer",
     "/v2/models/MODEL/ready", "/v2/models/MODEL/config", "/v2/models/MODEL/stats",
@@ -115,7 +115,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
         sentence = f"the method for {path[:80]} must be {allowed}, got {request.method}"
         refusal = Refusal(405, sentence, "rejected", {"Allow": allowed})
     elif error.status_code == 404:
-        hint = nearest(path[:200], _PATHS) or f", see {DOCUMENTATION}"
+        hint = nearest(path[:200], _PATHS) or f", see `{DOCUMENTATION}`"
         refusal = bad_request(f"the path must be one that is served here, got {path[:80]!r}{hint}", 404)
     else:
         refusal = bad_request(str(error.detail), error.status_code)

@@ -12,6 +12,7 @@ import urllib.parse
 import urllib.request
 
 from attentionvote.inference.server.access import is_loopback
+from attentionvote.inference.server.addresses import running_servers
 
 READY = "/v2/health/ready"
 URL = "http://127.0.0.1:8000"
@@ -20,7 +21,7 @@ _MOST_BYTES = 64 * 1024
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the verb's arguments."""
-    parser.add_argument("--url", default=URL, help=f"of the server, default {URL}")
+    parser.add_argument("--url", help=f"of the server; default: the one that this user runs here, else {URL}")
     parser.add_argument("--timeout-s", type=float, default=3.0, help="longest wait, default 3")
 
 
@@ -30,14 +31,23 @@ def run(options: argparse.Namespace) -> int:
     Returns:
         The exit code: 0 ready, 1 not ready or not reachable, 2 no usable address.
     """
-    parts = urllib.parse.urlsplit(options.url)
+    url = options.url
+    if url is None:
+        servers = running_servers()
+        if len(servers) > 1:
+            sentence = "--url must say which server is asked where several run, got none"
+            print(f"health: {sentence}: one of {', '.join(servers)}", file=sys.stderr)
+            return 2
+        url = servers[0] if servers else URL
+    parts = urllib.parse.urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        print(f"health: --url must be http://HOST:PORT or https://HOST:PORT, got {options.url!r}", file=sys.stderr)
+        print(f"health: --url must be http://HOST:PORT or https://HOST:PORT, got {url!r}", file=sys.stderr)
         return 2
     context = None
     if parts.scheme == "https":
         context = ssl.create_default_context()
-        if is_loopback(parts.hostname):  # a certificate names the machine to others, not to itself
+        # A certificate names the machine to others, not to itself.
+        if options.url is None or is_loopback(parts.hostname):
             context.check_hostname = False
             context.verify_mode = ssl.CERT_NONE
     address = f"{parts.scheme}://{parts.netloc}{READY}"

@@ -73,7 +73,7 @@ class Metrics:
             ["error"], registry=self.registry,
         )  # fmt: skip
         self.reload_failing = Gauge(
-            prefix + "reload_failing", "1 while the bundle at the served path cannot be served", registry=self.registry
+            prefix + "reload_failing", "1 while the bundle at the path is not what serves", registry=self.registry
         )
         self.from_last_known_good = Gauge(
             prefix + "serving_last_known_good", "1 while the copy of the last good bundle serves, not the given path",

@@ -24,7 +24,8 @@ from attentionvote.inference.errors import BundleError, InputError
 from attentionvote.inference.fetching import access as registry_access
 from attentionvote.inference.fetching.bundles import FetchedBundles
 from attentionvote.inference.scans.limits import MOST_POINTS
-from attentionvote.inference.server.access import Tokens, check_host
+from attentionvote.inference.server.access import Tokens, check_host, is_loopback
+from attentionvote.inference.server.addresses import Announcement, local_url
 from attentionvote.inference.server.admission import Gate
 from attentionvote.inference.server.answering import Answering, Limits
 from attentionvote.inference.server.application import application
@@ -40,6 +41,7 @@ from attentionvote.inference.server.worker.process import WorkerSettings
 from attentionvote.inference.server.worker.workers import Workers
 
 PORT = 8000
+CLEAR_TOKENS = "tokens cross the network unencrypted: give --tls-cert and --tls-key, or put TLS in front"
 # How long requests may take to end after SIGTERM, and threads after that: docker kills after 10 seconds.
 _DRAIN_S, _THREADS_S = 6, 1.5
 _BACKLOG = 256
@@ -207,6 +209,8 @@ def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.so
         say("last_known_good", settings.problem, logging.WARNING)
     if settings.tokens is not None and settings.tokens.readable_by_others:
         say("token", f"{options.token_file} can be read by everybody on this machine: chmod 600 it", logging.WARNING)
+    if settings.tokens is not None and not settings.tls and not is_loopback(options.host):
+        say("token", CLEAR_TOKENS, logging.WARNING)
     for warning in settings.source.warnings:
         say("registry", warning, logging.WARNING)
     config = uvicorn.Config(
@@ -218,10 +222,22 @@ def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.so
     most = connection_limit(raise_handle_limit(), 1 + options.queue)
     server = CellServer(config, listener, ConnectionBook(most, metrics))
     server.end_on_signals()
+    announcement = _announce(local_url(scheme, host, port))
     print(json.dumps({"url": url, "pid": os.getpid()}), flush=True)
     server.run()
+    if announcement is not None:
+        announcement.withdraw()
     say("end", "no request is open any more")
     _leave(settings.loader.store)
+
+
+def _announce(url: str) -> Announcement | None:
+    """Let `attentionvote health` know the address."""
+    try:
+        return Announcement(url)
+    except OSError as error:
+        say("start", f"attentionvote health needs --url {url}: {error.strerror or error}", logging.WARNING)
+    return None
 
 
 def _leave(store: LastKnownGood | None) -> None:

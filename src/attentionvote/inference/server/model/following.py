@@ -27,6 +27,7 @@ from attentionvote.inference.server.model.serving import Serving
 from attentionvote.inference.server.priority import be_polite
 
 _LONGEST_AWAY_S, _LONGEST_RETRY_S = 60.0, 300.0
+_SLOW_S = 60.0  # a step that lasts longer is said to: each of a bundle's files may take half a minute and more
 _MOST_TOLD = 100
 # Cells that were switched on together, or lost their registry together, must not ask in one voice.
 _JITTER = 0.2
@@ -108,9 +109,7 @@ class Following:
         """One question that never raises; how long to wait before the next one, seconds."""
         async with self._lock:
             try:
-                moved = await asyncio.get_running_loop().run_in_executor(
-                    self._thread, self._ask, self._served_digests()
-                )
+                moved = await self._asked()
             except RegistryError as error:
                 return self._failed("away" if error.away else "refused", str(error))
             except BundleError as error:
@@ -127,9 +126,32 @@ class Following:
         self._name_what_serves()
         return self._poll_s
 
+    async def _asked(self) -> bool:
+        """Whether the link was moved; a question that lasts long is a problem before it has ended."""
+        work = asyncio.get_running_loop().run_in_executor(self._thread, self._ask, self._served_digests())
+        try:
+            done, _ = await asyncio.wait({work}, timeout=_SLOW_S)
+            if not done:
+                self._tell(
+                    f"{self._bundles.reference} has been asked for or fetched for {_SLOW_S:g} s, and it is not over"
+                )
+            return await work
+        except asyncio.CancelledError:
+            work.cancel()
+            raise
+
     def _failed(self, outcome: str, sentence: str, trace: bool = False) -> float:
-        """Say why the registry's model does not serve, once for each reason; how long to wait, seconds."""
+        """Count and say a failure; how long to wait, seconds."""
         self._metrics.registry_polls.labels(outcome).inc()
+        self._tell(sentence, trace)
+        if outcome != "away":
+            self._away_s = self._poll_s
+            return self._poll_s
+        wait_s, self._away_s = self._away_s, min(2 * self._away_s, max(_LONGEST_AWAY_S, self._poll_s))
+        return wait_s
+
+    def _tell(self, sentence: str, trace: bool = False) -> None:
+        """Say why the registry's model does not serve, once for each reason."""
         self._metrics.registry_problem(sentence)
         serves = self._serving.current
         if sentence not in self._told:
@@ -140,11 +162,6 @@ class Following:
         self._own_problem = sentence
         if serves is None:
             self._serving.waits_for = sentence
-        if outcome != "away":
-            self._away_s = self._poll_s
-            return self._poll_s
-        wait_s, self._away_s = self._away_s, min(2 * self._away_s, max(_LONGEST_AWAY_S, self._poll_s))
-        return wait_s
 
     def _fine(self) -> None:
         """The link leads to what the registry names."""

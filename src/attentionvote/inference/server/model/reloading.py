@@ -70,6 +70,7 @@ class BundleWatch:
         self.explain: Callable[[], str | None] = lambda: None
         self._source, self._loader, self._serving, self._metrics = source, loader, serving, metrics
         self._poll_s, self._patience_s = poll_s, patience_s
+        self._not_kept_because: str | None = None
         self._tried: Mark | None = None
         self._retry_s, self._retry_at = _FIRST_RETRY_S, 0.0
         self._lock = asyncio.Lock()
@@ -117,6 +118,7 @@ class BundleWatch:
         due = forced or time.monotonic() >= self._retry_at
         if current is not None and not current.last_known_good and mark.digest == current.digest:
             self._tried = None
+            self._serves()
             if current.kept or store is None:
                 self._fine()
             elif due:
@@ -148,7 +150,10 @@ class BundleWatch:
     def _not_kept(self, error: Exception) -> None:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         self._later()
-        self._tell(f"the bundle serves but cannot be kept for the next start: {reason}; it is tried again")
+        if str(reason) != self._not_kept_because:
+            self._not_kept_because = str(reason)
+            sentence = f"the bundle serves but cannot be kept for the next start: {reason}; it is tried again"
+            say("last_known_good", sentence, logging.ERROR)
 
     def _failed(self, outcome: str, sentence: str, trace: bool = False) -> None:
         self._metrics.reloads.labels(outcome).inc()
@@ -178,8 +183,13 @@ class BundleWatch:
         self._retry_s = min(2 * self._retry_s, _LAST_RETRY_S)
 
     def _fine(self) -> None:
-        """The bundle at the path is the one that serves."""
+        """The bundle at the path serves, and nothing is left to be tried again."""
         self._retry_s = _FIRST_RETRY_S
+        self._not_kept_because = None
+        self._serves()
+
+    def _serves(self) -> None:
+        """The bundle at the path is the one that serves, kept or not: ``last_known_good_kept`` tells which."""
         if self.problem is not None:
             say("reload", "the bundle at the served path serves, the problem is over")
         self.problem = None
