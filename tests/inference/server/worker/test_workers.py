@@ -134,9 +134,7 @@ def test_a_job_that_hangs_keeps_the_next_ones_waiting_for_a_second(workers: Work
         assert hanging.result(PATIENCE_S) is not None
 
 
-def test_jobs_are_done_one_by_one_in_their_order(
-    make_bundle: Make, trusted_key: Path, make_cloud: Any, npy: Any
-) -> None:
+def test_jobs_are_done_in_their_order(make_bundle: Make, trusted_key: Path, make_cloud: Any, npy: Any) -> None:
     slow = Workers(load_bundle(make_bundle(graph={"loops": 100_000}), trusted_key), WorkerSettings())
     wait_for(lambda: slow._spare is not None)
     done: list[int] = []
@@ -195,6 +193,7 @@ def test_a_worker_that_ends_in_its_work_is_replaced(
     def kill_whoever_works() -> None:
         for pid in (pid_of(workers._active), pid_of(workers._spare)):
             wait_for(lambda pid=pid: any(pid_of(worker) == pid for worker in workers._since))
+            time.sleep(0.2)  # it has begun: one that ends before costs the job nothing
             os.kill(pid, number)
 
     killer = threading.Thread(target=kill_whoever_works)
