@@ -109,6 +109,13 @@ def test_only_one_module_imports_the_runtime_and_sets_the_variable_first(reposit
     assert [p.relative_to(package).as_posix() for p in importers if "inference" in p.parts] == ["inference/runtime.py"]
 
 
+def test_the_http_process_holds_neither_runtime_nor_scipy() -> None:
+    """They belong to the workers: what the server does not load can neither crash nor slow it."""
+    program = "import sys, attentionvote.inference.server.serve\n"
+    done = python(program + "print(sorted({'onnxruntime', 'scipy', 'PIL'} & set(sys.modules)))")
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
 def test_public_names_are_loaded_when_they_are_used() -> None:
     program = """
 import sys
