@@ -86,6 +86,10 @@ FINDINGS: dict[str, list[tuple[str, str]]] = {
         ("docker/test_service.py", "test_systemd_finds_it_closed"),
         ("docker/test_service.py", "test_it_can_be_enabled_and_comes_back"),
     ],
+    "S3-8 a place is taken before the body is there": [
+        (f"{_SERVER}/test_reception.py", "test_stalled_bodies_take_no_places"),
+        (f"{_SERVER}/test_reception.py", "test_the_oldest_gives_way_when_too_many_come"),
+    ],
     "S4-1 a registry that drips holds the cell's thread": [
         ("inference/fetching/test_bounded_http.py", "test_a_question_ends_in_its_time"),
         ("inference/fetching/test_bounded_http.py", "test_a_file_ends_in_its_time"),

@@ -1,13 +1,12 @@
 """Who may wait: a bounded number of requests, each with a deadline that starts when its first byte arrives.
 
-A request is admitted before its body is read, so the memory of bodies is bounded together with the queue. Its place
-is free again when its work has ended, not when its answer was sent: an answer may be early (the deadline), the
-estimator is busy all the same.
+A request takes its place when its body is there (``reception``), so that nobody holds one who only drips. The place is
+free again when the work has ended, not when the answer was sent: an answer may be early (the deadline), the worker is
+busy all the same.
 """
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 from starlette.requests import Request
@@ -15,8 +14,7 @@ from starlette.requests import Request
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.server.deadline import Deadline, deadline_seconds, late_answer
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.refusal import Refusal, bad_request
-from attentionvote.inference.server.worker.channel import SharedContent
+from attentionvote.inference.server.refusal import Refusal
 
 DEADLINE_HEADER, RETRY_HEADER = "X-Deadline-Ms", "X-Retry-After-Ms"
 
@@ -72,11 +70,11 @@ class Gate:
         self._metrics = metrics
         self._typical_s = 0.2
 
-    def enter(self) -> Place:
-        """Take a place.
+    def check(self) -> None:
+        """Refuse when there is no place, before a body is sent in vain.
 
         Raises:
-            Refusal: 503 with ``Retry-After`` when there is none.
+            Refusal: 503 with ``Retry-After``.
         """
         if self._inside >= self._most:
             raise Refusal(
@@ -86,6 +84,14 @@ class Gate:
                 # Whole seconds are the standard's; whoever knows the other header is back sooner.
                 {"Retry-After": str(max(1, math.ceil(self._typical_s))), RETRY_HEADER: f"{self._typical_s * 1e3:.0f}"},
             )
+
+    def enter(self) -> Place:
+        """Take a place.
+
+        Raises:
+            Refusal: 503 with ``Retry-After`` when there is none.
+        """
+        self.check()
         self._inside += 1
         self._metrics.waiting.set(self._inside)
         return Place(self)
@@ -98,40 +104,3 @@ class Gate:
     def took(self, seconds: float) -> None:
         """Learn how long an estimate takes, for ``Retry-After``."""
         self._typical_s += 0.2 * (seconds - self._typical_s)
-
-
-async def read_body(request: Request, most_bytes: int, deadline: Deadline) -> SharedContent:
-    """The body in shared memory, refused as soon as it is known to be too large. Whoever gets it closes it.
-
-    Raises:
-        Refusal: 413 beyond ``most_bytes``, 415 for a content encoding, 504 when the deadline passes first.
-        starlette.requests.ClientDisconnect: the client is gone.
-    """
-    encoding = request.headers.get("content-encoding", "identity")
-    if encoding != "identity":
-        raise bad_request(f"the body must be sent without compression, got Content-Encoding {encoding[:40]!r}", 415)
-    declared = request.headers.get("content-length", "")
-    if declared.isdecimal() and int(declared[:20]) > most_bytes:
-        raise _too_large(most_bytes, f"{declared[:20]}")
-    content = SharedContent()
-    try:
-        async with asyncio.timeout(max(deadline.remaining_s(), 0.0)):
-            async for chunk in request.stream():
-                if content.size + len(chunk) > most_bytes:
-                    raise _too_large(most_bytes, "more")
-                content.write(chunk)
-    except TimeoutError:
-        content.close()
-        raise too_late(deadline, "the body was received") from None
-    except BaseException:
-        content.close()
-        raise
-    return content
-
-
-def _too_large(most_bytes: int, got: str) -> Refusal:
-    return bad_request(
-        f"the body must have at most {most_bytes} bytes, got {got}: crop the cloud, or start the server with a larger "
-        "--max-body-mb",
-        413,
-    )

@@ -1,4 +1,4 @@
-"""One request for poses, from its first byte to the worker's answer: admitted, received, queued, run, in time."""
+"""One request for poses, from its first byte to the worker's answer: received, admitted, queued, run, in time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typing import Any
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
-from attentionvote.inference.server.admission import Gate, Place, deadline_from_header, read_body, too_late
+from attentionvote.inference.server.admission import Gate, Place, deadline_from_header, too_late
 from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.serving import Served, Serving
+from attentionvote.inference.server.reception import Reception
 from attentionvote.inference.server.refusal import Refusal
 from attentionvote.inference.server.tally import Tally
 from attentionvote.inference.server.worker.channel import Message, SharedContent
@@ -70,6 +71,7 @@ class Answering:
 
     def __init__(self, serving: Serving, gate: Gate, limits: Limits, metrics: Metrics) -> None:
         self.serving, self.gate, self.limits, self.metrics = serving, gate, limits, metrics
+        self.reception = Reception(limits.most_body_bytes)
         self.tally = Tally()
 
     async def ask(
@@ -90,10 +92,14 @@ class Answering:
         limits = self.limits
         deadline = deadline_from_header(request, limits.deadline_ms, limits.most_deadline_ms)
         self.serving.model(name, version)  # before a body is received for a model that is not there
-        place = self.gate.enter()
-        content = None
+        self.gate.check()
+        content = await self.reception.body(request, deadline)
         try:
-            content = await read_body(request, limits.most_body_bytes, deadline)
+            place = self.gate.enter()
+        except BaseException:
+            content.close()
+            raise
+        try:
             self._took(record, "receive", deadline.elapsed_s())
             served = self.serving.model(name, version)
             served.workers.hold()
@@ -101,8 +107,7 @@ class Answering:
             future = self.serving.submit(work.run)
         except BaseException:
             place.leave()
-            if content is not None:
-                content.close()
+            content.close()
             raise
         _leave_when_done(place, content, served, future)
         answer = await self._wait(request, future, deadline)

@@ -9,7 +9,6 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from attentionvote.inference.server.admission import read_body
 from attentionvote.inference.server.answering import Answering
 from attentionvote.inference.server.bounded_json import parse_json
 from attentionvote.inference.server.deadline import Deadline
@@ -17,6 +16,7 @@ from attentionvote.inference.server.model.reloading import Watch
 from attentionvote.inference.server.model.serving import Served
 from attentionvote.inference.server.protocol.answer import EXTENSIONS, model_config, model_metadata
 from attentionvote.inference.server.protocol.request import LENGTH_HEADER
+from attentionvote.inference.server.reception import Reception
 from attentionvote.inference.server.refusal import Refusal
 
 _MOST_INDEX_BYTES, _INDEX_S = 4096, 5.0
@@ -33,6 +33,7 @@ class ProtocolRoutes:
 
     def __init__(self, answering: Answering, watch: Watch, version: str) -> None:
         self._answering, self._serving, self._watch, self._version = answering, answering.serving, watch, version
+        self._reception = Reception(_MOST_INDEX_BYTES)
 
     def routes(self) -> list[Route]:
         """For the application."""
@@ -83,7 +84,7 @@ class ProtocolRoutes:
         return await self._answering.ask(request, job, **request.path_params)
 
     async def _index(self, request: Request) -> Response:
-        with await read_body(request, _MOST_INDEX_BYTES, Deadline(_INDEX_S)) as body:
+        with await self._reception.body(request, Deadline(_INDEX_S)) as body:
             if body.size:
                 parse_json("the request", body.content())  # `ready` may be asked for: all there is, is ready
         served = self._serving.current
