@@ -89,6 +89,22 @@ def drips(host: str, port: int, stop: threading.Event, count: Counter[str], rng:
             count["cut off"] += 1
 
 
+def stalled_bodies(host: str, port: int, stop: threading.Event, count: Counter[str], rng: random.Random) -> None:
+    """A dozen uploads that stop in the middle and wait for their deadlines."""
+    held: list[socket.socket] = []
+    head = b"POST /poses HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Deadline-Ms: 60000\r\nContent-Length: 900000\r\n\r\n"
+    while not stop.wait(0.2):
+        with suppress(OSError):
+            one = socket.create_connection((host, port), timeout=2)
+            one.sendall(head + bytes(rng.randrange(1, 500_000)))
+            held.append(one)
+            count["begun"] += 1
+        if len(held) > 12:
+            held.pop(0).close()
+    for one in held:
+        one.close()
+
+
 def bombs(host: str, port: int, stop: threading.Event, count: Counter[str], rng: random.Random) -> None:
     """Small bodies that want to become large, slow or endless."""
     bodies = list(bomb_bodies().values())
@@ -194,5 +210,6 @@ ATTACKS: dict[str, Attack] = {
     "damaged files": damaged_files,
     "silent connections": silent_connections,
     "drips": drips,
+    "stalled bodies": stalled_bodies,
     "bombs": bombs,
 }

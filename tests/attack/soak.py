@@ -76,7 +76,7 @@ def soak(bundle: Path, key: Path, seconds: float, seed: int, folder: Path) -> di
     words = [str(link), "--key", str(public), "--port", "0", "--state", str(folder / "state"), "--poll-s", "0.5"]
     with (folder / "server.log").open("wb") as log:
         server = subprocess.Popen(
-            [sys.executable, "-m", "attentionvote.inference.command_line", "serve", *words, "--queue", "8"],
+            [sys.executable, "-m", "attentionvote.inference.command_line", "serve", *words],
             stdout=subprocess.PIPE,
             stderr=log,
             start_new_session=True,
