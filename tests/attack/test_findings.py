@@ -33,7 +33,7 @@ FINDINGS: dict[str, list[tuple[str, str]]] = {
     "S1-4 small files end the server by memory": [
         ("inference/scans/test_array_bytes.py", "test_packings_that_unpack_without_limit_are_not_unpacked"),
         ("inference/scans/test_depth_files.py", "test_a_second_header_is_refused_before_anything_is_decoded"),
-        (_WORKERS, "test_a_body_that_takes_too_much_memory_is_refused_and_costs_its_worker"),
+        (_WORKERS, "test_a_body_that_takes_too_much_memory_is_refused_and_nothing_else"),
         ("attack/test_over_http.py", "test_no_body_keeps_the_next_one_waiting"),
     ],
     "S1-5 255 silent connections keep everybody out": [
@@ -117,6 +117,16 @@ FINDINGS: dict[str, list[tuple[str, str]]] = {
     ],
     "S4-9 config and stats of Triton's client are 404": [
         (f"{_SERVER}/protocol/test_routes.py", "test_tritons_config_and_statistics_are_true"),
+    ],
+    "A name of 8 MB is compared with the right one for minutes": [
+        ("inference/test_errors.py", "test_a_name_of_any_length_is_compared_at_once"),
+    ],
+    "A header of 30,000 odd characters leaves a worker counted as stuck": [
+        (_WORKERS, "test_a_job_that_cannot_be_sent_costs_nothing"),
+        ("attack/test_over_http.py", "test_odd_requests_are_one_sentence_each"),
+    ],
+    "Workers that are not taken up stay for ever": [
+        (f"{_SERVER}/model/test_bundle_loading.py", "test_workers_that_may_not_serve_are_closed"),
     ],
     "A blind sensor is an empty bin": [
         ("inference/test_estimator.py", "test_a_blind_sensor_is_no_empty_bin"),

@@ -55,6 +55,29 @@ def test_no_body_keeps_the_next_one_waiting(
     assert attacked_server.metric("ready") == 1
 
 
+@pytest.mark.parametrize(
+    ("head", "headers", "sentence"),
+    [
+        ({"outputs": [{"name": "abcdefgh" * 900_000}]}, {}, "an output must be one of"),
+        ({"inputs": [{"name": "abcdefgh" * 900_000}]}, {}, "the input must be named 'points'"),
+        ({}, {"Inference-Header-Content-Length": "\xff" * 30_000}, "must be a whole number of bytes"),
+        ({"inputs": [{"name": "points", "datatype": "FP32", "shape": [int("9" * 4000), 3]}]}, {}, "must have shape"),
+    ],
+    ids=["output", "input", "header", "shape"],
+)
+def test_odd_requests_are_one_sentence_each(
+    attacked_server: Any, head: dict[str, Any], headers: dict[str, str], sentence: str
+) -> None:
+    tensor = {"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [0.0, 0.0, 0.8]}
+    content = {"inputs": [tensor]} | head
+    begun = time.monotonic()
+    reply = attacked_server.post("/v2/models/bracket/infer", json.dumps(content).encode(), headers)
+    assert time.monotonic() - begun < 2
+    assert (reply.status, len(reply.error) < 500) == (400, True)
+    assert sentence in reply.error
+    assert attacked_server.get("/v2/health/ready").status == 200
+
+
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGSEGV, signal.SIGKILL])
 def test_whatever_happens_to_the_workers_a_request_is_answered_again(
     attacked_server: Any, make_cloud: Any, npy: Any, number: int

@@ -50,7 +50,7 @@ def test_results_are_the_estimators_own(frozen, make_box_model):
 
 
 def test_models_side_by_side_get_the_same_clouds_as_alone(frozen, make_box_model):
-    near, far = make_box_model("near"), make_box_model("far", offsets=[[0.3, 0, 0]] * 4)
+    near, far = make_box_model("near"), make_box_model("far", offsets=[[0.03, 0, 0]] * 4)
     alone = [measure([bundle], frozen)[0] for bundle in (near, far)]
     together = measure([near, far], frozen)
     for one, other in zip(alone, together, strict=True):

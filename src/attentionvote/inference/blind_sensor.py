@@ -60,8 +60,8 @@ def check_sight(
     if seen < least:
         raise BlindSensor(
             f"{seen} points were measured where the bin is, at least {least:.0f} are to be expected (a fifth of "
-            f"{expected:.0f}: {source}): is the sensor covered, dirty or wrongly exposed, or `bin` or `camera` of the "
-            "cell file wrong?",
+            f"{expected:.0f}: {source}): is the sensor covered, dirty or wrongly exposed, the cloud thinned out, or "
+            "`bin` or `camera` of the cell file wrong?",
             seen,
         )
 

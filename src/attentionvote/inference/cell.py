@@ -112,7 +112,7 @@ def parse_cell(content: bytes) -> Cell:
         InputError: with one sentence.
     """
     try:
-        described = json.loads(content, object_pairs_hook=_without_twins)
+        described = json.loads(content, parse_int=_whole_number, object_pairs_hook=_without_twins)
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
@@ -142,6 +142,11 @@ def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise InputError(f"each key must stand once in its object, got {key[:60]!r} twice: remove one of them")
         described[key] = value
     return described
+
+
+def _whole_number(digits: str) -> float:
+    """A whole number; one that no double holds is infinite, which every field refuses."""
+    return int(digits) if len(digits) < 20 else float(digits)
 
 
 def _check_keys(what: str, value: Any, known: Collection[str], needed: Collection[str]) -> None:

@@ -33,9 +33,12 @@ class Crop:
     def __post_init__(self) -> None:
         for name, shape in (("camera_from_bin", (4, 4)), ("size", (3,))):
             try:
-                value = np.asarray(getattr(self, name), dtype=np.float64)
-            except (TypeError, ValueError) as error:
+                value = np.asarray(getattr(self, name))
+            except ValueError as error:  # rows of several lengths
                 raise InputError(f"bin {name} must be {shape} numbers, got something else") from error
+            if value.dtype.kind not in "iuf":  # texts, or whole numbers beyond all size
+                raise InputError(f"bin {name} must be {shape} numbers, got something else")
+            value = value.astype(np.float64)
             if value.shape != shape or not np.isfinite(value).all():
                 raise InputError(f"bin {name} must be {shape} finite numbers, got shape {value.shape}")
             object.__setattr__(self, name, value)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+# Comparing takes time with the square of the length; no name that is served here is longer.
+_LONGEST_NAME = 200
+
 
 class InputError(ValueError):
     """What was sent or configured cannot be used: the caller must change it (HTTP 4xx, exit code 2)."""
@@ -32,5 +35,5 @@ class RegistryError(BundleError):
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """``, did you mean 'x'?`` when one of the valid names is close, else nothing."""
-    found = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
+    found = difflib.get_close_matches(name[:_LONGEST_NAME], list(valid), n=1, cutoff=0.5)
     return f", did you mean {found[0]!r}?" if found else ""

@@ -141,9 +141,10 @@ class PoseEstimator:
                 scan = measured_points(cloud, self.card, self._most_points)
                 facts["points_given"] = scan.given if depth is None else depth.size
                 facts["points_measured"] = scan.measured
+                facts["warnings"] = (*scan.warnings, *_sparse(facts, crop))
                 clock.lap("read")
                 prepared = prepare(scan, self.card, crop, self._measured_by(depth, camera), between=clock.check)
-            facts |= {"points_used": prepared.used, "warnings": (*prepared.warnings, *_sparse(facts, crop))}
+            facts |= {"points_used": prepared.used, "warnings": (*facts["warnings"], *prepared.warnings)}
             clock.lap("prepare")
             neighbors = find_neighbors(prepared.points, session.layout)
             outputs = session.run(prepared.points, prepared.normals, clock.left(), neighbors)

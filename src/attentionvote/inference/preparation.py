@@ -104,7 +104,7 @@ def prepare(
     if len(cloud) < least:
         where = f" are left in the bin of {seen} measured" if crop is not None else " were measured"
         raise TooFewPoints(f"{len(cloud)} points{where}, at least {least} are needed to look for parts", len(cloud))
-    warnings = (*scan.warnings, *check_scene(cloud, card))
+    warnings = check_scene(cloud, card)
     rng = np.random.default_rng(seed)
     dense = cloud if len(cloud) <= card.density else cloud[sample_indices(len(cloud), card.density, rng)]
     chosen = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])

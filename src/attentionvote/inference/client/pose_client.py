@@ -86,7 +86,7 @@ class PoseClient:
             raise ValueError(f"timeout_s must be positive seconds, got {timeout_s}")
         self._host, self._port, self._url = parts.hostname, parts.port, f"{parts.scheme}://{parts.netloc}"
         self._tls = ssl.create_default_context(cafile=ca_file) if parts.scheme == "https" else None
-        self._headers = {"Authorization": f"Bearer {token}"} if token is not None else {}
+        self._headers = {} if token is None else {"Authorization": f"Bearer {_checked_token(token)}"}
         self._timeout_s, self._part = timeout_s, part
         self._connection: TimedConnection | None = None
 
@@ -120,7 +120,7 @@ class PoseClient:
             }
         ).encode()
         if self._part is None:
-            self._part = str(_json(self._until("GET", "/", b"", {}, end))["model"]["name"])
+            self._part = _model_name(_json(self._until("GET", "/", b"", {}, end)))
         path = f"/v2/models/{urllib.parse.quote(self._part, safe='')}/infer"
         response = self._until("POST", path, head + raw, {LENGTH_HEADER: str(len(head))}, end)
         return decode_answer(response.body, response.headers.get(LENGTH_HEADER))
@@ -164,7 +164,7 @@ class PoseClient:
                 raise DeadlinePassed(f"{self._url} did not answer within the deadline")
             deadline = {"X-Deadline-Ms": f"{min(max(1e3 * left, 1.0), 60_000.0):.0f}"}
             response = self._send(method, path, body, {**headers, **deadline}, end + _GRACE_S)
-            if response.status == 200 and path == "/" and _json(response)["model"] is None:
+            if response.status == 200 and path == "/" and _json(response).get("model", {}) is None:
                 wait, unavailable = 0.5, Unavailable(f"{self._url} serves no model yet")
             elif response.status == 503:
                 wait, unavailable = _wait_s(response), Unavailable(_sentence(response))
@@ -232,6 +232,21 @@ def _sentence(response: _Response) -> str:
         return str(json.loads(response.body)["error"])
     except (ValueError, KeyError, TypeError):
         return f"the server answered with status {response.status} and no sentence"
+
+
+def _checked_token(token: str) -> str:
+    """A token as a header may carry it, without the line end of the file it was read from; never in a message."""
+    token = token.strip()
+    if not token or not all("!" <= character <= "~" for character in token):
+        raise ValueError("token must be printable ASCII characters without blanks, got others: is it the file's name?")
+    return token
+
+
+def _model_name(content: Mapping[str, Any]) -> str:
+    try:
+        return str(content["model"]["name"])
+    except (KeyError, TypeError) as error:
+        raise ServerFailed("the answer must name a model, but it does not: is it an attentionvote server?") from error
 
 
 def _json(response: _Response) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from attentionvote.inference.server.deadline import Deadline, deadline_seconds, 
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.refusal import Refusal
 
+_SHORTEST_S = 0.02
 DEADLINE_HEADER, RETRY_HEADER = "X-Deadline-Ms", "X-Retry-After-Ms"
 
 
@@ -103,4 +104,4 @@ class Gate:
 
     def took(self, seconds: float) -> None:
         """Learn how long an estimate takes, for ``Retry-After``."""
-        self._typical_s += 0.2 * (seconds - self._typical_s)
+        self._typical_s += 0.2 * (max(seconds, _SHORTEST_S) - self._typical_s)

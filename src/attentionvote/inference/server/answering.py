@@ -115,7 +115,8 @@ class Answering:
             if stage in record.seconds:
                 self._took(record, stage, record.seconds[stage])
         self.tally.add(served.version, record.seconds, answered=answer.head["status"] == 200)
-        self.gate.took(sum(record.seconds.get(stage, 0.0) for stage in ("parse", "estimate")))
+        if answer.head["status"] == 200:
+            self.gate.took(sum(record.seconds.get(stage, 0.0) for stage in ("parse", "estimate")))
         return self._response(answer, record)
 
     async def _wait(self, request: Request, future: Future[Message], deadline: Deadline) -> Message:

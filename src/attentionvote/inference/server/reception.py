@@ -12,7 +12,8 @@ from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.refusal import Refusal, bad_request
 from attentionvote.inference.server.worker.channel import SharedContent
 
-_MOST_AT_ONCE, _MOST_LARGE = 32, 4
+MOST_AT_ONCE = 32
+_MOST_LARGE = 4
 
 
 @dataclass(eq=False)
@@ -87,7 +88,7 @@ class Reception:
         """Let the oldest give way while there are too many, or too much of them."""
         staying = [one for one in self._incoming if not one.gives_way]
         size = sum(one.content.size for one in staying)
-        while len(staying) > _MOST_AT_ONCE or size > _MOST_LARGE * self._most_bytes:
+        while len(staying) > MOST_AT_ONCE or size > _MOST_LARGE * self._most_bytes:
             oldest = staying.pop(0)
             size -= oldest.content.size
             oldest.gives_way = True

@@ -37,6 +37,7 @@ from attentionvote.inference.server.model.serving import Serving
 from attentionvote.inference.server.model.source import Source, source_of
 from attentionvote.inference.server.network.book import ConnectionBook, connection_limit, raise_handle_limit
 from attentionvote.inference.server.network.listening import CellServer
+from attentionvote.inference.server.reception import MOST_AT_ONCE
 from attentionvote.inference.server.worker.process import WorkerSettings
 from attentionvote.inference.server.worker.workers import Workers
 
@@ -219,7 +220,7 @@ def _serve(options: argparse.Namespace, settings: _Settings, listener: socket.so
         timeout_keep_alive=_KEEP_ALIVE_S, timeout_graceful_shutdown=_DRAIN_S,
         ssl_certfile=options.tls_cert, ssl_keyfile=options.tls_key,
     )  # fmt: skip
-    most = connection_limit(raise_handle_limit(), 1 + options.queue)
+    most = connection_limit(raise_handle_limit(), MOST_AT_ONCE + 1 + options.queue)
     server = CellServer(config, listener, ConnectionBook(most, metrics))
     server.end_on_signals()
     announcement = _announce(local_url(scheme, host, port))

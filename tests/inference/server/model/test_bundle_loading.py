@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from attentionvote.inference.bundles.bundle import load_bundle
+from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.server.model.bundle_loading import BundleLoader, mark_of
+from attentionvote.inference.server.model.last_known_good import LastKnownGood
 from attentionvote.inference.server.worker.process import WorkerSettings
 from attentionvote.inference.server.worker.workers import Workers
 
@@ -48,3 +49,23 @@ def test_a_served_model_was_verified_and_tested(bundle_folder: Path, trusted_key
         file.write(b"x")
     with pytest.raises(BundleError, match=r"model\.onnx must have .* bytes"):
         loader.from_source(bundle_folder, must_keep=False)
+
+
+def test_workers_that_may_not_serve_are_closed(bundle_folder: Path, trusted_key: Path, tmp_path: Path) -> None:
+    """The folder changes after the self-test and before its copy is made."""
+    started: list[Workers] = []
+
+    class Changing(LastKnownGood):
+        def keep(self, source: Path, bundle: Bundle, trusted: Trusted) -> None:
+            (source / "extra").write_text("x")
+            super().keep(source, bundle, trusted)
+
+    def start(bundle: Bundle, _: bool) -> Workers:
+        started.append(Workers(bundle, WorkerSettings()))
+        return started[-1]
+
+    store = Changing(tmp_path / "state")
+    with pytest.raises(BundleError, match="extra is not in"):
+        BundleLoader(trusted_key, start, store).from_source(bundle_folder, must_keep=True)
+    assert not started[0].available
+    store.close()

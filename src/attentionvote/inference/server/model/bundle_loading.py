@@ -100,6 +100,9 @@ class BundleLoader:
                 workers.close()
                 raise
             failure = error
+        except BaseException:  # the folder is no longer what was loaded
+            workers.close()
+            raise
         kept = self.store is not None and failure is None
         return Served(workers, kept, last_known_good=False, origin=self._origin(bundle)), failure
 

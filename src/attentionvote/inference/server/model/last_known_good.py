@@ -106,6 +106,7 @@ class LastKnownGood:
             OSError: when it cannot be written (a full disk, say); the copies before are untouched.
             BundleError: when the folder is no longer what was loaded.
         """
+        self._kept.mkdir(parents=True, exist_ok=True, mode=0o700)  # somebody may have removed it meanwhile
         entries = self.entries()
         number = 1 + (int(entries[0].name.partition("-")[0]) if entries else 0)
         target = self._kept / f"{number:08d}-{bundle.digest[:12]}"

@@ -20,7 +20,6 @@ from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.bundle_loading import BundleLoader, Mark, mark_of
 from attentionvote.inference.server.model.serving import Served, Serving
-from attentionvote.inference.server.priority import be_polite
 
 T = TypeVar("T")
 _FIRST_RETRY_S, _LAST_RETRY_S = 2.0, 300.0  # the same bundle again: disks get free, networks come back
@@ -74,7 +73,7 @@ class BundleWatch:
         self._tried: Mark | None = None
         self._retry_s, self._retry_at = _FIRST_RETRY_S, 0.0
         self._lock = asyncio.Lock()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reload", initializer=be_polite)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reload")
 
     async def run(self) -> None:
         """Load the first model, then watch until cancelled."""
@@ -176,6 +175,8 @@ class BundleWatch:
         elif self._serving.current is None:
             self._metrics.reloads.labels("last_known_good").inc()
             self._serving.swap(served)
+        else:  # the path was quicker after all
+            served.workers.close()
 
     def _later(self) -> None:
         """Try again after a while, each time a longer one."""

@@ -25,6 +25,7 @@ OUTPUTS = {
     "camera_from_part": "FP64", "confidence": "FP32", "heat": "FP32", "class_index": "INT64", "part": "BYTES",
 }  # fmt: skip
 _MOST_ID = 256
+_MOST_ROWS = 2**31
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict, _SHORT.maxstring, _SHORT.maxlong = 2, 6, 3, 60, 24
 
@@ -107,7 +108,7 @@ def _points(tensor: Mapping[str, Any], tail: memoryview) -> NDArray[np.float32]:
         not isinstance(shape, list)
         or len(shape) != 2
         or any(isinstance(n, bool) or not isinstance(n, int) for n in shape)
-        or shape[0] < 0
+        or not 0 <= shape[0] <= _MOST_ROWS
         or shape[1] != 3
     ):
         raise InputError(f"input {INPUT!r} must have shape [P, 3] with P >= 0, got {_short(shape)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.metadata
 from typing import Any
 
@@ -19,7 +20,8 @@ from attentionvote.inference.server.protocol.request import LENGTH_HEADER
 from attentionvote.inference.server.reception import Reception
 from attentionvote.inference.server.refusal import Refusal
 
-_MOST_INDEX_BYTES, _INDEX_S = 4096, 5.0
+_MOST_INDEX_BYTES, _INDEX_S, _LOOK_S = 4096, 5.0, 30.0
+_LONGEST_LENGTH = 40
 
 
 class ProtocolRoutes:
@@ -34,6 +36,7 @@ class ProtocolRoutes:
     def __init__(self, answering: Answering, watch: Watch, version: str) -> None:
         self._answering, self._serving, self._watch, self._version = answering, answering.serving, watch, version
         self._reception = Reception(_MOST_INDEX_BYTES)
+        self._looking: asyncio.Task[str | None] | None = None
 
     def routes(self) -> list[Route]:
         """For the application."""
@@ -80,7 +83,7 @@ class ProtocolRoutes:
         return JSONResponse({"name": served.name, "ready": True})
 
     async def _infer(self, request: Request) -> Response:
-        job = {"kind": "infer", "header_length": request.headers.get(LENGTH_HEADER)}
+        job = {"kind": "infer", "header_length": _short(request.headers.get(LENGTH_HEADER))}
         return await self._answering.ask(request, job, **request.path_params)
 
     async def _index(self, request: Request) -> Response:
@@ -98,11 +101,22 @@ class ProtocolRoutes:
     async def _load(self, request: Request) -> Response:
         if self._serving.current is not None:
             self._serving.model(request.path_params["name"])
-        problem = await self._watch.check()
+        if self._looking is None or self._looking.done():  # all who ask meanwhile get the same answer
+            self._looking = asyncio.create_task(self._watch.check())
+        done, _ = await asyncio.wait({self._looking}, timeout=_LOOK_S)
+        if not done:
+            sentence = f"the look at the bundle must end within {_LOOK_S:g} s, but it goes on: the index has its result"
+            raise Refusal(504, sentence, "rejected")
+        problem = self._looking.result()
         if problem is not None:
             raise Refusal(409, problem, "rejected")
         served = self._serving.model()
         return JSONResponse({"name": served.name, "version": served.version, "state": "READY"})
+
+
+def _short(text: str | None) -> str | None:
+    """A header's value for a worker, which refuses it; no right one is longer."""
+    return None if text is None else text[:_LONGEST_LENGTH]
 
 
 def registered(served: Served) -> dict[str, Any]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from attentionvote.inference.answer import Abstention, Estimate
@@ -31,8 +32,12 @@ class Jobs:
     def __init__(self, estimator: PoseEstimator, cell: Cell) -> None:
         self._estimator, self._cell = estimator, cell
 
-    def do_next(self, channel: Channel) -> bool:
-        """Wait for a job, do it and answer it; False when there was no memory for it: then nothing is sure any more.
+    def do_next(self, channel: Channel, recovered: Callable[[], bool]) -> bool:
+        """Wait for a job, do it and answer it; False when it took more memory than it may and did not give it back.
+
+        Args:
+            channel: of the jobs.
+            recovered: whether the process is as small as before its jobs.
 
         Raises:
             ChannelClosed: when the server has ended.
@@ -49,9 +54,12 @@ class Jobs:
             head, body = _refused(422, "rejected", _TOO_LARGE), b""
         except Exception:
             head, body = {"status": 500, "outcome": "failed", "trace": traceback.format_exc(limit=20)}, b""
+        if head["status"] == 422:
+            gc.collect()
+            head["ends"] = not recovered()
         with SharedContent.of(body) as content:
             channel.send(head | {"seconds": work.seconds}, content if body else None)
-        return head.get("error") != _TOO_LARGE
+        return not head.get("ends")
 
 
 _TOO_LARGE = (

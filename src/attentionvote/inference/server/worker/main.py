@@ -52,9 +52,12 @@ def main(channel_handle: int, lifeline: int) -> int:
         channel.send({"problem": problem})
         if jobs is None:
             return 1
-        _limit_memory(int(message.head["job_memory_bytes"]))
+        job_bytes = int(message.head["job_memory_bytes"])
         del message
-        while jobs.do_next(channel):
+        loaded = _data_bytes()
+        # Of what the process shares with nobody: a body in shared memory does not count.
+        resource.setrlimit(resource.RLIMIT_DATA, (loaded + job_bytes, loaded + job_bytes))
+        while jobs.do_next(channel, lambda: _data_bytes() < loaded + job_bytes // 4):
             pass
     except ChannelClosed:
         return 0
@@ -67,11 +70,11 @@ def _end_with_the_server(lifeline: int) -> None:
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)  # SIGIO, which ends it
 
 
-def _limit_memory(job_bytes: int) -> None:
-    """Let a job have so much memory beside what is loaded; shared contents do not count."""
+def _data_bytes() -> int:
+    """Memory of this process that it shares with nobody, reserved or used."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
-    (loaded,) = (int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmData:"))
-    resource.setrlimit(resource.RLIMIT_DATA, (loaded + job_bytes, loaded + job_bytes))
+    (data,) = (int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmData:"))
+    return data
 
 
 def _loaded(message: Message) -> tuple[Jobs | None, str | None]:

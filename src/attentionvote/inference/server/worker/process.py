@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,15 +124,13 @@ class WorkerProcess:
         job: dict[str, Any],
         content: SharedContent,
         deadline: Deadline,
-        renamed: Callable[[float], None] = lambda _: None,
     ) -> Message:
         """Let it do a job.
 
         Args:
             job: what to do, see ``jobs``.
             content: the request's body.
-            deadline: of the job.
-            renamed: told the budget in seconds when the body names another than the deadline's.
+            deadline: of the job; takes the budget that the body names.
 
         Raises:
             WorkerEnded: it had ended before.
@@ -144,9 +142,14 @@ class WorkerProcess:
             self._expect(deadline)
         try:
             self._channel.send(job | {"budget_s": deadline.budget_s, "start": deadline.start}, content)
+            return self._answer(deadline)
         except ChannelClosed as error:
-            self._busy_until = None
             raise WorkerEnded from error
+        finally:
+            self._busy_until = None
+
+    def _answer(self, deadline: Deadline) -> Message:
+        """The answer to a job that was sent."""
         begun = False
         try:
             while True:
@@ -155,9 +158,8 @@ class WorkerProcess:
                 if "status" in answer.head:
                     return answer
                 begun = True
-                if "budget_s" in answer.head:
+                if "budget_s" in answer.head:  # the body names another deadline
                     deadline.budget_s = float(answer.head["budget_s"])
-                    renamed(deadline.budget_s)
         except TimeoutError as error:
             self._process.kill()
             raise WorkerLost("deadline", f"a job ran {OVERRUN_S:g} s beyond its deadline and was killed") from error
@@ -166,13 +168,12 @@ class WorkerProcess:
             if begun:
                 raise loss from error
             raise WorkerEnded from error  # it was ending already, and has not seen the job
-        finally:
-            self._busy_until = None
 
     def kill(self) -> None:
         """End it at once."""
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):  # a process in a broken driver dies later
+            self._process.wait(OVERRUN_S)
         with self._handles:
             if self._open and self._busy_until is None:  # else whoever asks it still holds them, and kills it as well
                 self._open = False
@@ -237,7 +238,10 @@ class WorkerProcess:
                 "its graph does not end, or this machine is too slow for it (--self-test-s)"
             ) from error
         except (ChannelClosed, KeyError, TypeError, ValueError) as error:
-            raise BundleError(f"{bundle.path}: loading it ended its process: {self._post_mortem().detail}") from error
+            loss = self._post_mortem()
+            if loss.reason == "memory":  # the machine's fault, and worth another try
+                raise OSError(errno.ENOMEM, loss.detail) from error
+            raise BundleError(f"{bundle.path}: loading it ended its process: {loss.detail}") from error
         if problem is not None:
             raise BundleError(f"{bundle.path}: {problem}" if self_test else str(problem))
 
@@ -249,7 +253,7 @@ class WorkerProcess:
         words = self._last_words()
         self._process.kill()
         if code == -signal.SIGKILL or any(sign in words for sign in _OUT_OF_MEMORY):
-            return WorkerLost("memory", f"the worker took more memory than there is ({_ended(code)})")
+            return WorkerLost("memory", f"the worker was ended, for its memory or by hand ({_ended(code)})")
         return WorkerLost("crashed", f"the worker {_ended(code)}{': ' if words else ''}{words}")
 
     def _last_words(self) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 
 from attentionvote.contract import ModelCard
 from attentionvote.inference.bundles.bundle import Bundle
-from attentionvote.inference.errors import BundleError
 from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.worker.channel import Message, SharedContent
@@ -101,7 +100,6 @@ class Workers:
         job: dict[str, Any],
         content: SharedContent,
         deadline: Deadline,
-        renamed: Callable[[float], None] = lambda _: None,
     ) -> Message | None:
         """Let a worker do a job; None when the deadline passed before there was one.
 
@@ -115,7 +113,7 @@ class Workers:
             if worker is None:
                 break
             try:
-                answer = worker.ask(job, content, deadline, renamed)
+                answer = worker.ask(job, content, deadline)
             except WorkerEnded:  # while nobody asked: this job goes to the next one
                 self._drop(worker, "crashed", "a worker ended while it had nothing to do")
                 continue
@@ -129,8 +127,8 @@ class Workers:
                 with self._changed:
                     self._since.pop(worker, None)
                     self._changed.notify_all()
-            if answer.head.get("status") == 422:
-                self._drop(worker, "memory", "a job needed more memory than --job-memory-mb allows")
+            if answer.head.get("ends"):
+                self._drop(worker, "memory", "a job took more memory than it may, and did not give it back")
             return answer
         return None
 
@@ -212,9 +210,9 @@ class Workers:
                 continue
             try:
                 spare = WorkerProcess(self._bundle, self._settings, self_test=False, polite=not alone)
-            except (BundleError, OSError) as error:
+            except Exception as error:  # whatever it is, without a spare the next loss is an outage
                 say("worker", f"no spare worker can be started: {error}; it is tried again", logging.ERROR)
-                self._wait(retry_s)
+                self._wait(_FIRST_RETRY_S if alone else retry_s)
                 retry_s = min(2 * retry_s, _LAST_RETRY_S)
                 continue
             retry_s = _FIRST_RETRY_S
