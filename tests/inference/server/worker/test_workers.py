@@ -234,6 +234,14 @@ def test_a_worker_that_ends_in_its_work_is_replaced(
     workers.close()
 
 
+def test_a_spare_that_does_not_listen_is_replaced_before_it_is_needed(workers: Workers, losses: list[str]) -> None:
+    deaf = pid_of(workers._spare)
+    os.kill(deaf, signal.SIGSTOP)
+    wait_for(lambda: losses == ["deadline"])
+    wait_for(lambda: workers._spare is not None and pid_of(workers._spare) != deaf)
+    assert not Path(f"/proc/{deaf}").exists()
+
+
 def test_workers_that_end_idle_cost_no_request(workers: Workers, losses: list[str], make_cloud: Any, npy: Any) -> None:
     for worker in (workers._active, workers._spare):
         os.kill(pid_of(worker), signal.SIGKILL)

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 _MOST_BYTES = 128 * 1024
 Buffer = bytes | bytearray | memoryview
+# A job that only shows whether a worker listens.
+PING = {"kind": "ping"}
 
 
 class ChannelClosed(ConnectionError):

@@ -18,7 +18,7 @@ from attentionvote.inference.scans.depth_files import PNG_MAGIC, read_depth
 from attentionvote.inference.server.deadline import Deadline, deadline_seconds, late_answer
 from attentionvote.inference.server.protocol.answer import answer_parameters, encode_answer, pose_tensors
 from attentionvote.inference.server.protocol.request import LENGTH_HEADER, InferRequest, parse_request
-from attentionvote.inference.server.worker.channel import Channel, Message, SharedContent
+from attentionvote.inference.server.worker.channel import PING, Channel, Message, SharedContent
 
 
 class Jobs:
@@ -43,6 +43,9 @@ class Jobs:
             ChannelClosed: when the server has ended.
         """
         message = channel.receive()
+        if message.head["kind"] == PING["kind"]:
+            channel.send({"status": 200})
+            return True
         channel.send({"begun": True})
         work = _Job(self._estimator, self._cell, channel, message)
         del message

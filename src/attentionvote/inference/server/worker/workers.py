@@ -13,11 +13,12 @@ from attentionvote.contract import ModelCard
 from attentionvote.inference.bundles.bundle import Bundle
 from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.json_logs import say
-from attentionvote.inference.server.worker.channel import Message, SharedContent
+from attentionvote.inference.server.worker.channel import PING, Message, SharedContent
 from attentionvote.inference.server.worker.process import Loss, WorkerEnded, WorkerLost, WorkerProcess, WorkerSettings
 
 _TRIES = 5
 _PATIENCE_S = 1.0  # how long a job may keep the next one waiting
+_PING_S, _PING_EVERY_S = 0.5, 1.0
 _LOOK_S, _FIRST_RETRY_S, _LAST_RETRY_S = 0.5, 1.0, 60.0
 
 
@@ -195,7 +196,7 @@ class Workers:
 
     def _keep_a_spare(self) -> None:
         """Start a spare whenever there is none, and notice workers that end while nobody asks them."""
-        retry_s = _FIRST_RETRY_S
+        retry_s, next_ping = _FIRST_RETRY_S, time.monotonic()
         while True:
             with self._changed:
                 if not self._closed and self._spare is not None:
@@ -207,6 +208,9 @@ class Workers:
             for worker in idle:
                 self._drop(worker, "crashed", "a worker ended while it had nothing to do")
             if not missing:
+                if time.monotonic() >= next_ping:
+                    self._check_spare()
+                    next_ping = time.monotonic() + _PING_EVERY_S
                 continue
             try:
                 spare = WorkerProcess(self._bundle, self._settings, self_test=False, polite=not alone)
@@ -223,6 +227,25 @@ class Workers:
                     self._changed.notify_all()
             if closed:
                 spare.kill()
+
+    def _check_spare(self) -> None:
+        """A spare that does not listen would be noticed in the worst moment: by the request that needs it."""
+        with self._changed:
+            spare = self._spare
+            if spare is None or spare in self._since:
+                return
+            self._since[spare] = time.monotonic()
+        try:
+            with SharedContent() as nothing:
+                spare.ask(PING, nothing, Deadline(_PING_S))
+        except WorkerEnded:
+            self._drop(spare, "crashed", "a spare worker ended while it had nothing to do")
+        except WorkerLost as loss:
+            self._drop(spare, loss.reason, "a spare worker did not listen and was ended")
+        finally:
+            with self._changed:
+                self._since.pop(spare, None)
+                self._changed.notify_all()
 
     def _wait(self, seconds: float) -> None:
         until = time.monotonic() + seconds
