@@ -122,14 +122,14 @@ class WorkerProcess:
     def ask(
         self,
         job: dict[str, Any],
-        content: SharedContent,
+        content: SharedContent | None,
         deadline: Deadline,
     ) -> Message:
         """Let it do a job.
 
         Args:
             job: what to do, see ``jobs``.
-            content: the request's body.
+            content: the request's body; None where the job needs none.
             deadline: of the job; takes the budget that the body names.
 
         Raises:

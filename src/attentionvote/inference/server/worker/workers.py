@@ -195,7 +195,17 @@ class Workers:
         say("worker", f"{detail}; {'its spare' if stands else 'the next one'} goes on", logging.ERROR, reason=reason)
 
     def _keep_a_spare(self) -> None:
-        """Start a spare whenever there is none, and notice workers that end while nobody asks them."""
+        """Look after both until they are closed, whatever happens."""
+        while True:
+            try:
+                self._look_after_both()
+                return
+            except Exception as error:  # without this thread the next loss would be an outage
+                say("worker", f"the workers could not be looked after: {error!r}; it is tried again", logging.ERROR)
+                self._wait(_FIRST_RETRY_S)
+
+    def _look_after_both(self) -> None:
+        """Start a spare whenever there is none, and notice workers that end or hang while nobody asks them."""
         retry_s, next_ping = _FIRST_RETRY_S, time.monotonic()
         while True:
             with self._changed:
@@ -236,8 +246,7 @@ class Workers:
                 return
             self._since[spare] = time.monotonic()
         try:
-            with SharedContent() as nothing:
-                spare.ask(PING, nothing, Deadline(_PING_S))
+            spare.ask(PING, None, Deadline(_PING_S))
         except WorkerEnded:
             self._drop(spare, "crashed", "a spare worker ended while it had nothing to do")
         except WorkerLost as loss:
