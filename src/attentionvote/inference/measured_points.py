@@ -55,8 +55,7 @@ def measured_points(points: NDArray[Any], card: ModelCard, most_points: int = MO
     flat = points.reshape(-1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
         cloud = flat.astype(np.float32, copy=False)
-    # Column by column: a sum over three columns takes a tenth of the time of a test of rows, and no copy.
-    with np.errstate(over="ignore", invalid="ignore"):
+        # Column by column: a sum over three columns takes a tenth of the time of a test of rows, and no copy.
         size = np.abs(cloud[:, 0]) + np.abs(cloud[:, 1]) + np.abs(cloud[:, 2])
     there = (size > 0) & np.isfinite(size)
     if not there.all():

@@ -1,9 +1,8 @@
 """A client of a cell's server: numpy and the standard library, nothing else."""
 
-from attentionvote.inference.client.pose_client import (
+from attentionvote.inference.client.answer import (
     Answer,
     DeadlinePassed,
-    PoseClient,
     PoseClientError,
     Rejected,
     ServerFailed,
@@ -11,6 +10,7 @@ from attentionvote.inference.client.pose_client import (
     Unavailable,
     Unreachable,
 )
+from attentionvote.inference.client.pose_client import PoseClient
 
 __all__ = [
     "Answer",

@@ -33,18 +33,6 @@ from attentionvote.inference.client.answer import (
 )
 from attentionvote.inference.client.timed_connection import TimedConnection
 
-__all__ = [
-    "Answer",
-    "DeadlinePassed",
-    "PoseClient",
-    "PoseClientError",
-    "Rejected",
-    "ServerFailed",
-    "Unauthorized",
-    "Unavailable",
-    "Unreachable",
-]
-
 _MOST_ANSWER_BYTES = 64 * 1024 * 1024
 # The server gives up at the deadline; its answer about that needs a moment to arrive.
 _GRACE_S = 1.0

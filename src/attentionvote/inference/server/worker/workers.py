@@ -125,9 +125,7 @@ class Workers:
                 crashed = True  # perhaps by no fault of this job: a second worker tells
                 continue
             finally:
-                with self._changed:
-                    self._since.pop(worker, None)
-                    self._changed.notify_all()
+                self._free(worker)
             if answer.head.get("ends"):
                 self._drop(worker, "memory", "a job took more memory than it may, and did not give it back")
             return answer
@@ -176,6 +174,12 @@ class Workers:
         if self._spare in self._since or time.monotonic() - self._since[self._active] < _PATIENCE_S:
             return None
         return self._spare
+
+    def _free(self, worker: WorkerProcess) -> None:
+        """A worker has nothing to do any more."""
+        with self._changed:
+            self._since.pop(worker, None)
+            self._changed.notify_all()
 
     def _drop(self, worker: WorkerProcess, reason: Loss, detail: str) -> None:
         """A worker is lost: the spare takes its place at once, and another spare is started."""
@@ -252,9 +256,7 @@ class Workers:
         except WorkerLost as loss:
             self._drop(spare, loss.reason, "a spare worker did not listen and was ended")
         finally:
-            with self._changed:
-                self._since.pop(spare, None)
-                self._changed.notify_all()
+            self._free(spare)
 
     def _wait(self, seconds: float) -> None:
         until = time.monotonic() + seconds
