@@ -22,9 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 from bench_row import NotMeasured, Row, Unequal, measure
 from bench_rows import ROWS, chosen
-from command import Refused, command, configuring
-from configuration import compose, sentence
 from omegaconf import DictConfig
+
+from attentionvote.command.configuration import compose
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import Refused, sentence
 
 if TYPE_CHECKING:
     from bench_material import Material

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmark_page import kept_beside, record_of
-from json_files import write_json
+
+from attentionvote.files import write_json
 
 SECTION = "speed"
 COMMAND = "make bench"

@@ -14,11 +14,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from command import Refused, command, configuring
-from configuration import CONF, ConfigurationError, compose, parse, sentence, words_beside, words_of
 from fleet import words_of_verbs
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_hardware
+
+from attentionvote.command.conf_folder import CONF
+from attentionvote.command.configuration import compose
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError, Refused, sentence
+from attentionvote.command.words import parse, words_beside, words_of
 
 if TYPE_CHECKING:
     from benchmark_table import Row
@@ -39,7 +43,8 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     from benchmark_page import draw, markdown, put
     from benchmark_record import BenchmarkRecord
     from benchmark_table import BenchmarkTable
-    from folder_lock import locked_folder
+
+    from attentionvote.files import locked_folder
 
     plain: Any = OmegaConf.to_container(cfg.table, resolve=True)
     with configuring():
@@ -92,7 +97,8 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
 
 def _measure(cfg: DictConfig, words: Sequence[str], row: Row, name: str) -> dict[str, Any] | None:
     from benchmark_cells import baseline_cell, network_cell
-    from hardware import cores
+
+    from attentionvote.execution.hardware import cores
 
     here, own = cfg.copy(), Path(cfg.benchmarks)
     part = words_of(("object",), words)
@@ -112,7 +118,8 @@ def record(cfg: DictConfig, objects: Sequence[str]) -> dict[str, Any]:
     """Generate the frozen scenes of these parts and write their digests into ``RECORDED``; no mesh, no scenes."""
     from evaluation_job import generated_set, set_spec
     from hydra.utils import instantiate
-    from whole_files import write_whole
+
+    from attentionvote.files import write_whole
 
     content: Any = OmegaConf.load(RECORDED)
     frozen = dict(content.get("frozen", {}))

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmark_table import Row
-from configuration import compose
 from fleet_member import MemberTask
-from json_files import read_json, write_json
+
+from attentionvote.command.configuration import compose
+from attentionvote.files import read_json, write_json
 
 if TYPE_CHECKING:
     from attentionvote.part import Part

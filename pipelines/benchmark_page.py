@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmark_table import BenchmarkTable, Curve, mean, title_of
-from json_files import read_json
-from whole_files import whole, write_whole
+
+from attentionvote.files import read_json, whole, write_whole
 
 NOT_RUN = "not run"
 Cells = Mapping[tuple[str, str], Mapping[str, Any]]  # (row, object) -> what was measured

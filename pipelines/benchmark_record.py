@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmark_page import kept_beside, record_of
-from json_files import write_json
+
+from attentionvote.files import write_json
 
 
 @dataclass

@@ -12,9 +12,10 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from command import ConfigurationError, command
 from omegaconf import DictConfig
-from refusal import Refused
+
+from attentionvote.command.entry import command
+from attentionvote.command.errors import ConfigurationError, Refused
 
 if TYPE_CHECKING:
     from attentionvote.datasets.check import Report

@@ -12,9 +12,10 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from command import command, configuring
-from json_files import read_json, write_json
 from omegaconf import DictConfig
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.files import read_json, write_json
 
 log = logging.getLogger("attentionvote.evaluate")
 
@@ -23,7 +24,8 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     """Measure, record, show; the figures."""
     from evaluation_job import EvaluationJob, is_recorded
     from evaluation_report import described, record, show
-    from folder_lock import locked_folder
+
+    from attentionvote.files import locked_folder
 
     with configuring():
         job = EvaluationJob.find(cfg)

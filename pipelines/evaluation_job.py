@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware import cores
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from several_parts import only_part
 
+from attentionvote.execution.hardware import cores
 from attentionvote.inference import Bundle, load_bundle
 from attentionvote.inference.bundles.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
-from attentionvote.part import Parts
+from attentionvote.part import Parts, only_part
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_directory, scene_set_specs
 
 if TYPE_CHECKING:

@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from export_proof import judge, prove
-from folder_lock import locked_folder
-from hardware import cores
 from hydra.utils import instantiate
-from json_files import read_json, write_json
 from omegaconf import DictConfig
 from training_job import MODEL, RESULT
 
 import attentionvote
+from attentionvote.execution.hardware import cores
+from attentionvote.files import locked_folder, read_json, write_json
 from attentionvote.inference import Bundle, BundleError, load_bundle
 from attentionvote.inference.bundles.signature import (
     PRIVATE_NAME,

@@ -16,11 +16,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from command import Refused, command, configuring
-from configuration import ConfigurationError, choices, compose, nearest, parse, sentence, words_beside
 from omegaconf import DictConfig
-from several_parts import only_part
 from train import preset_of_workers
+
+from attentionvote.command.conf_folder import choices
+from attentionvote.command.configuration import compose
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError, Refused, nearest, sentence
+from attentionvote.command.words import parse, words_beside
+from attentionvote.part import only_part
 
 if TYPE_CHECKING:
     from fleet_member import MemberTask
@@ -39,10 +43,11 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         words: it was composed of; those of the training are handed on to every part.
     """
     import fleet_board
-    from executors import cores_of_a_job, executor_of
     from fleet_member import MemberTask
-    from folder_lock import locked_folder
-    from job_process import handed_on
+
+    from attentionvote.command.executors import cores_of_a_job, executor_of
+    from attentionvote.execution.job_process import handed_on
+    from attentionvote.files import locked_folder
 
     training = [*preset_of_workers(cfg, words), *training_words(words)]
     with configuring():

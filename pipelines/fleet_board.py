@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from json_files import write_json
 from promotion_job import DATA_FACT
 from training_job import TrainingJob
-from whole_files import write_whole
 
+from attentionvote.files import write_json, write_whole
 from attentionvote.inference import BundleError, load_bundle
 from attentionvote.simulation import SceneSet, scene_set_directory
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from job_process import JobProcess
+from attentionvote.execution.job_process import JobProcess
 
 VERBS = ("train", "export", "evaluate")
 SCRIPTS = Path(__file__).resolve().parent

@@ -14,10 +14,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from command import ConfigurationError, command, configuring
-from executors import executor_of
-from hardware import cores
 from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.command.executors import executor_of
+from attentionvote.execution.hardware import cores
 
 log = logging.getLogger("attentionvote.generate")
 

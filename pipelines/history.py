@@ -9,8 +9,9 @@ import logging
 from time import localtime, strftime
 from typing import Any
 
-from command import command, configuring
 from omegaconf import DictConfig
+
+from attentionvote.command.entry import command, configuring
 
 log = logging.getLogger("attentionvote.history")
 

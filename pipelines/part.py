@@ -11,9 +11,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from command import ConfigurationError, command, configuring
 from omegaconf import DictConfig
-from whole_files import whole, write_whole
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.files import whole, write_whole
 
 if TYPE_CHECKING:
     from attentionvote.part import Part

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from command import command, configuring
 from omegaconf import DictConfig
+
+from attentionvote.command.entry import command, configuring
 
 
 def run(cfg: DictConfig) -> dict[str, Any]:

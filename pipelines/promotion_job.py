@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from configuration import ConfigurationError
 from evaluation_job import EvaluationJob, trusted_key
 from evaluation_report import described, show
 from omegaconf import DictConfig
-from refusal import Refused
 
+from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.export import Limits
 from attentionvote.inference import Bundle
 from attentionvote.registry.gates import Evidence, Gate, Rules, judge

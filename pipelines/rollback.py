@@ -12,9 +12,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from command import command, configuring
 from omegaconf import DictConfig
-from refusal import Refused
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import Refused
 
 log = logging.getLogger("attentionvote.rollback")
 

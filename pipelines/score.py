@@ -9,8 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from command import ConfigurationError, command, configuring
 from omegaconf import DictConfig
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError
 
 EXAMPLES = {"gt": "gt=test/gt", "results": "results=out/results"}
 

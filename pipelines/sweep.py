@@ -12,10 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from command import command, configuring
-from configuration import choices, compose, primary_groups, words_beside, words_of
 from omegaconf import DictConfig, OmegaConf
 from train import preset_of_workers
+
+from attentionvote.command.conf_folder import choices, primary_groups
+from attentionvote.command.configuration import compose
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.words import words_beside, words_of
 
 _PLACE = ("executor", "cluster")  # settings that say where trials run
 
@@ -27,9 +30,10 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         cfg: the sweep's configuration.
         words: it was composed of, the machine's default included; those of the training are handed on to the trials.
     """
-    from folder_lock import locked_folder
     from sweep_job import SweepJob
     from sweep_report import check_save_as
+
+    from attentionvote.files import locked_folder
 
     check_save_as(cfg.save_as, words=words)
     with configuring():

@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from folder_lock import is_locked
-from job_process import INTERRUPTED, JobProcess, Outcome, interrupt
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sweep_study import Ledger
 from trial_place import PRUNED_AT, PRUNED_CODE, log_of
+
+from attentionvote.execution.job_process import INTERRUPTED, JobProcess, Outcome, interrupt
+from attentionvote.files import is_locked
 
 log = logging.getLogger("attentionvote.sweep")
 TRAIN = Path(__file__).with_name("train.py")

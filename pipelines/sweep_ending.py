@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from configuration import CONF
 from optuna.trial import FrozenTrial, TrialState
 from sweep_report import experiment_text, importances, run_of, write_table
 from sweep_study import Ledger
-from whole_files import write_whole
+
+from attentionvote.command.conf_folder import CONF
+from attentionvote.files import write_whole
 
 if TYPE_CHECKING:
     from attentionvote.tracking import Run

@@ -9,9 +9,6 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from configuration import ConfigurationError, compose
-from executors import cluster_of, cores_of_a_job, executor_of
-from hardware import gpu_of_slot, visible_gpus
 from omegaconf import DictConfig, OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 from sweep_driver import TRAIN, SweepDriver
@@ -23,7 +20,11 @@ from sweep_study import Ledger, make_pruner, open_study, study_name
 from training_job import find_training
 from trial_place import for_trial, log_of, on_worker
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.command.executors import cluster_of, cores_of_a_job, executor_of
 from attentionvote.execution import RayCluster
+from attentionvote.execution.hardware import gpu_of_slot, visible_gpus
 
 TRIAL_JOB = Path(__file__).with_name("trial_job.py")
 log = logging.getLogger("attentionvote.sweep")

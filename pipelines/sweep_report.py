@@ -12,15 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]
-from configuration import CONF, ConfigurationError, parse
-from json_files import read_json
 from optuna.exceptions import OptunaError
 from optuna.importance import get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 from sweep_space import Setting
 from sweep_study import CRASHES, Ledger
-from training_job import NOT_IDENTITY, RUN
-from whole_files import write_whole
+from training_job import RUN
+
+from attentionvote.command.conf_folder import CONF
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.command.words import parse
+from attentionvote.files import read_json, write_whole
 
 MARK = "Written by make sweep"  # files without it are the user's, and never replaced
 _LEAST_FOR_IMPORTANCE = 4  # complete trials

@@ -7,10 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from configuration import ConfigurationError, check_types, leaves, nearest, type_problem
 from omegaconf import DictConfig, OmegaConf
-from schema import violation
-from training_job import NOT_IDENTITY, find_training
+from training_job import find_training
+
+from attentionvote.command.configuration import check_types, leaves, type_problem
+from attentionvote.command.errors import ConfigurationError, nearest
+from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.command.schema import violation
 
 if TYPE_CHECKING:
     from optuna.trial import Trial

@@ -21,9 +21,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from command import command, configuring
 from omegaconf import DictConfig
 from training_processes import Place, be_silent, failing_at_once, first_speaks, refuse_grid
+
+from attentionvote.command.entry import command, configuring
 
 log = logging.getLogger("attentionvote.train")
 

@@ -6,11 +6,11 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from executors import executor_of
 from omegaconf import DictConfig
 from training_job import TrainingJob
 from training_processes import FirstDoes, Place
 
+from attentionvote.command.executors import executor_of
 from attentionvote.data import Clouds, CloudSettings, measure_clouds
 from attentionvote.data.dataset_split import DatasetSplit
 from attentionvote.simulation import SceneSet, generate_scene_set, scene_set_directory

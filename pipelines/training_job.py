@@ -11,25 +11,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from executors import executor_of
-from folder_lock import locked_folder
 from hydra.utils import instantiate
-from json_files import read_json
 from omegaconf import DictConfig, OmegaConf
-from several_parts import check_classes, only_part
+from several_parts import check_classes
 
-from attentionvote.part import Parts
+from attentionvote.command.executors import executor_of
+from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.files import locked_folder, read_json
+from attentionvote.part import Parts, only_part
 from attentionvote.simulation import SceneSetSpec, Sensor, scene_set_specs
 
 if TYPE_CHECKING:
     from attentionvote.data.dataset_splits import DatasetSplits
 
 log = logging.getLogger("attentionvote.train")
-# What may change between two calls that mean the same training: it does not change what is learned.
-NOT_IDENTITY = (
-    *("resume", "force", "workers", "executor", "cluster", "tracking", "outputs", "root"),
-    *("data.workers", "trainer.threads"),
-)
 RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
 
 

@@ -17,8 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from configuration import ConfigurationError, sentence
-from hardware import cores
+from attentionvote.command.errors import ConfigurationError, sentence
+from attentionvote.execution.hardware import cores
 
 FirstDoes = Callable[[str, Callable[[], Any]], Any]  # see ``attentionvote.training.processes``
 _VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")

@@ -11,9 +11,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from hardware import cores
 from hydra.utils import instantiate
-from json_files import write_json
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
@@ -28,6 +26,8 @@ from training_tracking import open_tracking
 
 from attentionvote import __version__
 from attentionvote.data import Augmentation, Clouds, CloudSettings, PartDataModule
+from attentionvote.execution.hardware import cores
+from attentionvote.files import write_json
 from attentionvote.model import AttentionVote
 from attentionvote.simulation import Sensor
 from attentionvote.tracking.store import connect, resolve_store

@@ -6,11 +6,11 @@ import json
 import logging
 from typing import Any
 
-from json_files import write_json
 from omegaconf import DictConfig, OmegaConf
 from training_job import RUN, TrainingJob
 
 from attentionvote import tracking
+from attentionvote.files import write_json
 from attentionvote.training import PoseTraining
 
 log = logging.getLogger("attentionvote.train")

@@ -14,13 +14,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from configuration import sentence
-from folder_lock import locked_folder
-from job_process import INTERRUPTED, Outcome, handed_on, join_starter, report_failure
 from trial_place import VARIABLE, WORKER
 from trial_task import TrialTask
 
+from attentionvote.command.errors import sentence
 from attentionvote.execution import WorkerDied, executor_named, run_all
+from attentionvote.execution.job_process import INTERRUPTED, Outcome, handed_on, join_starter, report_failure
+from attentionvote.files import locked_folder
 
 
 def main() -> int:

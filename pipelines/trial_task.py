@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from folder_lock import is_locked
-from job_process import JobProcess, Outcome, interrupt
+from attentionvote.execution.job_process import JobProcess, Outcome, interrupt
+from attentionvote.files import is_locked
 
 _POLL_S = 0.1
 _LOOK_S = 2.0  # between looks at the claim

@@ -9,8 +9,10 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from command import ConfigurationError, command, configuring
 from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from attentionvote.part import Parts

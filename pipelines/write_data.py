@@ -16,10 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from command import ConfigurationError, command, configuring
-from hardware import cores
-from json_files import read_json, write_json
 from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.command.entry import command, configuring
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.execution.hardware import cores
+from attentionvote.files import read_json, write_json
 
 if TYPE_CHECKING:
     from attentionvote.part import Parts
@@ -32,9 +34,9 @@ IPA_SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Generate what is missing, write it; where it is and how much."""
     from hydra.utils import instantiate
-    from several_parts import only_part
 
     from attentionvote.datasets.dataset import RECEIPT
+    from attentionvote.part import only_part
     from attentionvote.simulation import PartCaster, generate_scene_set, scene_set_directory, scene_set_specs
 
     start = time.monotonic()

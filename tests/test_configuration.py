@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from configuration import CONF, compose, leaves, primary_groups
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
-from schema import violation
 
+from attentionvote.command.conf_folder import CONF, primary_groups
+from attentionvote.command.configuration import compose, leaves
+from attentionvote.command.schema import violation
 from attentionvote.part import Part, PartSet
 
 FILES = sorted(CONF.rglob("*.yaml"))

@@ -164,3 +164,18 @@ class PartSet:
 
 
 Parts = Part | PartSet  # what lies in a bin
+
+
+def only_part(parts: Parts, verb: str) -> Part:
+    """The part of an object that describes one.
+
+    Raises:
+        ValueError: when it describes several.
+    """
+    if len(parts.parts) > 1:
+        names = ", ".join(part.name for part in parts.parts)
+        raise ValueError(
+            f"object must be one part for {verb}, got {parts.name} with the parts {names}: choose one of them "
+            "(docs/several-parts.md says what works for several)"
+        )
+    return parts.parts[0]

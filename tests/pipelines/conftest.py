@@ -19,9 +19,9 @@ def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
     and the smoke chain uses it.
     """
     import numpy as np
-    from configuration import compose
     from scipy.spatial import ConvexHull
 
+    from attentionvote.command.configuration import compose
     from attentionvote.simulation import load_part
     from attentionvote.simulation.cad import BUILTIN_PARTS
     from attentionvote.simulation.decomposition import cache_directory, hull_file

@@ -11,9 +11,9 @@ from typing import Any
 import bench
 import bench_rows
 import pytest
-from configuration import compose
-from refusal import Refused
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import Refused
 from attentionvote.geometry import sampling_reference
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,11 +11,12 @@ from typing import Any
 
 import benchmark
 import pytest
-from configuration import ConfigurationError, compose
 from export_job import ExportJob
-from json_files import write_json
 from training_job import find_training
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.files import write_json
 from attentionvote.inference import load_bundle
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,8 +10,9 @@ from benchmark_cells import CellFailed, cells_of_parts
 from benchmark_page import markdown, put
 from benchmark_record import BenchmarkRecord
 from benchmark_table import BenchmarkTable
-from configuration import compose
 from omegaconf import OmegaConf
+
+from attentionvote.command.configuration import compose
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 

@@ -7,8 +7,10 @@ from typing import Any
 import pytest
 import yaml
 from benchmark_table import BenchmarkTable, mean, title_of
-from configuration import CONF, choices, compose
 from omegaconf import OmegaConf
+
+from attentionvote.command.conf_folder import CONF, choices
+from attentionvote.command.configuration import compose
 
 NAMES = sorted(path.stem for path in (CONF / "table").glob("*.yaml"))
 

@@ -10,17 +10,19 @@ import time
 from pathlib import Path
 
 import pytest
-from command import ConfigurationError, configuring
 from hydra.errors import InstantiationException
 
+from attentionvote.command.entry import configuring
+from attentionvote.command.errors import ConfigurationError
+
 PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
-REAL_VERBS = sorted(p.stem for p in PIPELINES.glob("*.py") if "from command import" in p.read_text(encoding="utf-8"))
+REAL_VERBS = sorted(p.stem for p in PIPELINES.glob("*.py") if "from attentionvote.command.entry import command" in p.read_text(encoding="utf-8"))
 SCRIPT = '''
 """A verb that does what it is told."""
 import logging, os, sys, time
 from pathlib import Path
 sys.path.insert(0, {pipelines!r})
-from command import command, configuring
+from attentionvote.command.entry import command, configuring
 log = logging.getLogger("attentionvote.fake")
 def run(cfg):
     print("a library prints"); os.system("echo a child prints"); log.info("working")

@@ -8,7 +8,9 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from configuration import ConfigurationError, compose, leaves, nearest, sentence, type_problem
+
+from attentionvote.command.configuration import compose, leaves, type_problem
+from attentionvote.command.errors import ConfigurationError, nearest, sentence
 
 FILES = {
     "fake.yaml": """

@@ -11,11 +11,12 @@ import evaluate
 import numpy as np
 import pytest
 import write_data
-from configuration import ConfigurationError, compose
 from dataset_scenes import DatasetScenes
 from evaluation_job import EvaluationJob
 from hydra.utils import instantiate
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.data.dataset_split import DatasetSplit
 
 WRITTEN = ["object=brick", "simulation=smoke", "simulation.drop_counts=[2,5]", "split=test", "workers=1"]

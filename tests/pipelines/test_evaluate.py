@@ -6,9 +6,10 @@ import json
 
 import evaluate
 import pytest
-from configuration import ConfigurationError, compose
 
 from attentionvote import tracking
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.tracking.store import connect
 
 

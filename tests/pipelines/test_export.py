@@ -14,8 +14,9 @@ from typing import Any
 import export
 import pytest
 import torch
-from configuration import ConfigurationError, compose
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.inference import load_bundle
 from attentionvote.model import AttentionVote
 from attentionvote.training.checkpoint import load_trained, save_trained

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 import torch
-from configuration import compose
 from hydra.utils import instantiate
 from several_parts import described, network_arguments
 
+from attentionvote.command.configuration import compose
 from attentionvote.evaluation.by_part import COUNTS
 from attentionvote.inference import PoseEstimator, load_bundle
 from attentionvote.model import AttentionVote

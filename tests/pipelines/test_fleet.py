@@ -15,13 +15,14 @@ from typing import Any
 import fleet
 import fleet_board
 import pytest
-from configuration import ConfigurationError, compose
 from export_job import ExportJob
-from json_files import write_json
 from train import preset_of_workers
 from training_job import find_training
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.execution import LocalPool
+from attentionvote.files import write_json
 from attentionvote.registry.history import History
 from attentionvote.registry.promotion import move, stand
 from attentionvote.registry.versions import Versions

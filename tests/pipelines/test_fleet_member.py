@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 from fleet_member import VERBS, MemberTask
-from job_process import handed_on
+
+from attentionvote.execution.job_process import handed_on
 
 # Stands for every verb: keeps what it was told, and its tracking user.
 VERB = """

@@ -8,8 +8,9 @@ from pathlib import Path
 import generate
 import numpy as np
 import pytest
-from configuration import ConfigurationError, compose
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.part import Part
 from attentionvote.simulation.scene_set import SceneSet
 

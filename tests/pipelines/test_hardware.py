@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 import pytest
-from hardware import cores, gpu_of_slot, visible_gpus
+
+from attentionvote.execution.hardware import cores, gpu_of_slot, visible_gpus
 
 
 def limited(monkeypatch: pytest.MonkeyPatch, allowed: int, quota: str | None) -> int:

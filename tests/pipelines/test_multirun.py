@@ -23,7 +23,7 @@ SCRIPT = '''
 import json, os, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, {pipelines!r})
-from command import command, configuring
+from attentionvote.command.entry import command, configuring
 def run(cfg):
     print("a library prints")
     Path(f"pid-{{cfg.do}}").write_text(str(os.getpid()))
@@ -202,7 +202,7 @@ def test_runs_stand_below_one_parent_that_is_found_again(
 
 
 def test_the_parent_of_one_part_lives_with_its_runs(put_tables: Callable[[Path], str], tmp_path: Path) -> None:
-    import multirun
+    from attentionvote.command import grid as multirun
 
     store = put_tables(tmp_path / "mlflow.db")
     settings = {"object": {"name": "gear"}, "tracking": {"store": store, "parent": None}}

@@ -11,10 +11,12 @@ import numpy as np
 import part
 import pytest
 import trimesh
-from configuration import CONF, ConfigurationError, compose
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from attentionvote.command.conf_folder import CONF
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.simulation.symmetry_detection import symmetry_residual
 

@@ -15,10 +15,10 @@ import history
 import promote
 import pytest
 import rollback
-from configuration import ConfigurationError, compose
-from refusal import Refused
 
 from attentionvote import tracking
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.registry.versions import Versions
 

@@ -18,9 +18,9 @@ from pathlib import Path
 import promote
 import pytest
 import rollback
-from configuration import compose
 
 from attentionvote import tracking
+from attentionvote.command.configuration import compose
 from attentionvote.inference.client.pose_client import PoseClient
 from attentionvote.tracking.server import serve
 

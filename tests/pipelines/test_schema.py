@@ -6,9 +6,11 @@ from functools import cache
 from typing import Any
 
 import pytest
-from configuration import CONF, choices, compose, leaves, primary_groups
 from omegaconf import OmegaConf
-from schema import RANGES, Range, range_of, violation
+
+from attentionvote.command.conf_folder import CONF, choices, primary_groups
+from attentionvote.command.configuration import compose, leaves
+from attentionvote.command.schema import RANGES, Range, range_of, violation
 
 VERBS = sorted(p.stem for p in CONF.glob("*.yaml"))
 

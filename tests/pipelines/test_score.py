@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import score
-from configuration import ConfigurationError, compose
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.evaluation import write_ground_truth, write_results
 
 # threshold_scale: AP, F1, MAP, R99, R50, TP, FP, FN

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import score
 from bop_split import HEADER, BopSplit, csv_row
-from configuration import ConfigurationError, compose
+
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 
 
 def words(split: BopSplit, *more: str) -> list[str]:

@@ -14,13 +14,15 @@ from typing import Any
 import optuna
 import pytest
 import sweep
-from configuration import CONF, ConfigurationError, compose
 from optuna.trial import TrialState
 from sweep_job import SweepJob
 from sweep_report import MARK, check_save_as, experiment_text
 from training_job import find_training
 
 from attentionvote import tracking
+from attentionvote.command.conf_folder import CONF
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.tracking.store import connect, resolve_store
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,9 +6,12 @@ from typing import Any
 
 import optuna
 import pytest
-from configuration import CONF, ConfigurationError, choices, compose
 from omegaconf import DictConfig, OmegaConf
 from sweep_space import parse_space
+
+from attentionvote.command.conf_folder import CONF, choices
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 
 RATE = {"name": "trainer.learning_rate", "kind": "float", "low": 0.001, "high": 0.01, "log": True}
 

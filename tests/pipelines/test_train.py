@@ -23,10 +23,11 @@ import numpy as np
 import pytest
 import torch
 import train
-from configuration import ConfigurationError, compose
 from tiny_training import TINY_TRAINING
 
 from attentionvote import tracking
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.tracking import figures, scene_pictures
 
 ROOT = Path(__file__).resolve().parents[2]

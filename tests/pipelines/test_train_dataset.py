@@ -11,13 +11,14 @@ from typing import Any
 import fleet_board
 import pytest
 import train
-from configuration import ConfigurationError, compose
 from dataset_scenes import DatasetScenes
 from tiny_training import TINY_TRAINING
 from training_job import find_training
 from training_tracking import DATASET
 from written_piles import pile_records, write_piles
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.data import Clouds, CloudSettings
 from attentionvote.part import Part
 from attentionvote.simulation import Sensor, load_part

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 import train
-from configuration import compose
 from tiny_training import TINY_TRAINING
 
+from attentionvote.command.configuration import compose
 from attentionvote.training.checkpoint import load_trained
 
 # An epoch has the steps of the smoke preset's (3 of 4 scenes); scenes, clouds and network are smaller.

@@ -19,10 +19,12 @@ from typing import Any
 import pytest
 import start_processes
 import train
-from configuration import ConfigurationError, compose
 from same_training import assert_same_training, runs
 from tiny_training import TINY_TRAINING
 from training_processes import Place, first_speaks, refuse_grid
+
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 
 ROOT = Path(__file__).resolve().parents[2]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import view
-from configuration import ConfigurationError, compose
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError
 from attentionvote.simulation import load_part, scene_set, scene_set_directory, scene_set_specs
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]

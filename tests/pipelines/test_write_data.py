@@ -11,9 +11,9 @@ import check_data
 import numpy as np
 import pytest
 import write_data
-from configuration import ConfigurationError, compose
-from refusal import Refused
 
+from attentionvote.command.configuration import compose
+from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.datasets import open_datasets
 from attentionvote.simulation.scene_set import SceneSet
 

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 import train
-from configuration import compose
 
 from attentionvote import tracking
+from attentionvote.command.configuration import compose
 from attentionvote.tracking.server import free_port
 from attentionvote.tracking.store import connect, experiment_id
 

@@ -11,10 +11,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
+from attentionvote.files import sync
 from attentionvote.inference import BundleError, Estimate, PoseEstimator
 from attentionvote.inference.bundles.bundle import Bundle, load_bundle
 from attentionvote.inference.bundles.manifest import CARD, GOLDEN, MESH, MODEL, write_manifest
-from attentionvote.inference.durable import sync
 from attentionvote.inference.golden import clear_confidence, self_test
 from attentionvote.part import Parts
 from attentionvote.simulation.mesh import write_surface

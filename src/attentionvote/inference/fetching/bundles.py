@@ -20,10 +20,10 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
+from attentionvote.files import sync
 from attentionvote.inference.bundles.bundle import load_bundle
 from attentionvote.inference.bundles.manifest import MANIFEST, MOST_MANIFEST_BYTES, SIGNATURE, Entry, parse_manifest
 from attentionvote.inference.bundles.signature import verify
-from attentionvote.inference.durable import sync
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.fetching.record import FetchRecord
 from attentionvote.inference.fetching.reference import PREFIX, Reference, RegistryVersion

@@ -7,7 +7,7 @@ import os
 from collections.abc import Collection
 from pathlib import Path
 
-from attentionvote.inference.durable import sync
+from attentionvote.files import sync
 from attentionvote.inference.fetching.reference import Reference, RegistryVersion
 
 NAME = "registry.json"

@@ -18,9 +18,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from attentionvote.files import sync
 from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.bundles.manifest import MANIFEST, SIGNATURE, files_in, most_bytes, opened, read_file
-from attentionvote.inference.durable import sync
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.fetching.reference import SCHEME, Reference
 from attentionvote.inference.home_folder import home_folder

@@ -1,7 +1,7 @@
 """The range of every setting: one table, first matching pattern wins.
 
 Types need no table: an override must have the type of the default it replaces
-(``pipelines/configuration.py``). Ranges hold for whatever the final value is, from a file or from the
+(``configuration.py``). Ranges hold for whatever the final value is, from a file or from the
 command line. ``None`` (null) always passes: whether a setting may be null is its default's business.
 """
 

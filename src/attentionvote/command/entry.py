@@ -8,7 +8,7 @@ A verb is a script ``pipelines/<verb>.py`` with a function ``run(cfg) -> dict``:
 The dictionary is printed as the only line on stdout, one JSON object; everything else that is
 printed while the verb runs, by anybody, goes to stderr. Exit codes: 0 success, 2 impossible
 configuration (before any work), 130 interrupted, 1 anything else (``Refused`` prints its line too).
-With ``-m`` the words are a grid of jobs (``multirun.py``). Heavy imports belong inside ``run``, so that
+With ``-m`` the words are a grid of jobs (``grid.py``). Heavy imports belong inside ``run``, so that
 ``--help`` and a misspelt word are answered at once.
 """
 
@@ -25,14 +25,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from configuration import CONF, ConfigurationError, choices, compose, leaves, primary_groups, sentence
 from hydra.errors import InstantiationException
-from job_process import join_starter, report_failure
-from multirun import run_grid
 from omegaconf import DictConfig, OmegaConf
-from refusal import Refused
 
-__all__ = ["ConfigurationError", "command", "configuring"]
+from attentionvote.command.conf_folder import CONF, choices, primary_groups
+from attentionvote.command.configuration import compose, leaves
+from attentionvote.command.errors import ConfigurationError, Refused, sentence
+from attentionvote.command.grid import run_grid
+from attentionvote.execution.job_process import join_starter, report_failure
+from attentionvote.files import FolderUnavailable
 
 Run = Callable[[DictConfig], dict[str, Any] | None]
 Defaults = Callable[[list[str]], list[str]]
@@ -86,7 +87,7 @@ def configuring(what: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except ConfigurationError:
+    except (ConfigurationError, FolderUnavailable):
         raise
     except InstantiationException as error:
         cause = _root(error)
@@ -174,7 +175,7 @@ def _one_sentence(verb: str) -> Iterator[None]:
     """Every exception becomes one sentence on stderr and an exit code."""
     try:
         yield
-    except ConfigurationError as error:
+    except (ConfigurationError, FolderUnavailable) as error:
         _leave(f"{verb}: {sentence(error)}", 2)
     except Refused as error:
         _leave(f"{verb}: {sentence(error)}", 1)

@@ -6,76 +6,30 @@ with the nearest valid name, before any work starts:
 * a group choice that does not exist (``object=conecting_rod``) or a group that must be chosen;
 * a setting that does not exist (``trainer.max_epoch=3``, ``lr=1``);
 * a value of another type than the default it replaces (``trainer.lr=abc``);
-* a value outside its range (``pipelines/schema.py``);
+* a value outside its range (``schema.py``);
 * an interpolation or a mandatory value that cannot be resolved.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from difflib import get_close_matches
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from schema import range_of, violation
 from yaml import YAMLError  # type: ignore[import-untyped]
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
-
-
-class ConfigurationError(ValueError):
-    """What the user asked for is impossible; the message is one sentence. Ends a verb with exit code 2."""
-
-
-def sentence(error: BaseException) -> str:
-    """The message of ``error`` on one line, or the name of its class when it has none."""
-    if isinstance(error, FileNotFoundError) and error.filename is not None:
-        return f"file not found: {error.filename}"
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """The end of a sentence, ``, did you mean 'x'?``, or nothing when no valid name is near."""
-    names = list(valid)
-    by_leaf = [v for v in names if v.rpartition(".")[2] == name.rpartition(".")[2]]
-    close = by_leaf or get_close_matches(name, names, n=1, cutoff=0.6)
-    if not close:
-        leaves = {v.rpartition(".")[2]: v for v in reversed(names)}
-        close = [leaves[leaf] for leaf in get_close_matches(name.rpartition(".")[2], leaves, n=1, cutoff=0.7)]
-    return f", did you mean {close[0]!r}?" if close else ""
-
-
-def choices(group: str, conf: Path = CONF) -> list[str]:
-    """The names that may be chosen for a group, sorted."""
-    return sorted(p.stem for p in (conf / group).glob("*.yaml"))
-
-
-def groups(conf: Path = CONF) -> list[str]:
-    """Every group, as ``a`` or ``a/b``."""
-    return sorted(p.relative_to(conf).as_posix() for p in conf.rglob("*") if p.is_dir() and any(p.glob("*.yaml")))
-
-
-def primary_groups(verb: str, conf: Path = CONF) -> dict[str, str | None]:
-    """Group and choice of a verb's defaults list, those of other verbs' files that it includes among them."""
-    primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
-    assert isinstance(primary, dict)
-    found: dict[str, str | None] = {}
-    for item in primary.get("defaults", []):
-        if isinstance(item, dict):
-            for group, choice in item.items():
-                found[str(group).removeprefix("override ").removeprefix("optional ").split("@")[0].strip("/")] = choice
-        elif (conf / f"{item}.yaml").is_file():
-            found |= primary_groups(item, conf)
-    return found
+from attentionvote.command.conf_folder import CONF, choices, groups
+from attentionvote.command.errors import ConfigurationError, nearest, sentence
+from attentionvote.command.schema import range_of, violation
+from attentionvote.command.words import parse
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -85,37 +39,6 @@ def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from leaves(value, f"{prefix}.{key}" if prefix else str(key))
     elif prefix:
         yield prefix, node
-
-
-def parse(overrides: Sequence[str]) -> list[Override]:
-    """The words after the verb, parsed by Hydra's grammar.
-
-    Raises:
-        ConfigurationError: on a word that is no ``key=value``.
-    """
-    parsed = []
-    for word in overrides:
-        try:
-            parsed.append(OverridesParser.create().parse_override(word))
-        except (OverrideParseException, HydraException) as error:
-            raise ConfigurationError(f"every argument must be key=value, got {word!r}") from error
-    return parsed
-
-
-def words_of(sections: Collection[str], words: Sequence[str]) -> list[str]:
-    """The words that choose or change one of these sections (what a setting's name has before its first dot)."""
-    return [word for word, section in _sections(words) if section in sections]
-
-
-def words_beside(verb: str, more: Collection[str], words: Sequence[str]) -> list[str]:
-    """The words that a verb hands on: neither of settings that its own file makes, nor of the sections ``more``."""
-    own = set(OmegaConf.load(CONF / f"{verb}.yaml")) - {"defaults"} | set(more)
-    return [word for word, section in _sections(words) if section not in own]
-
-
-def _sections(words: Sequence[str]) -> list[tuple[str, str]]:
-    """Every word with its section."""
-    return [(word, str(o.key_or_group).split(".")[0]) for word, o in zip(words, parse(words), strict=True)]
 
 
 def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfig:

@@ -16,9 +16,11 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from configuration import ConfigurationError, parse
-from job_process import INTERRUPTED, JobProcess, Outcome
 from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.command.words import parse
+from attentionvote.execution.job_process import INTERRUPTED, JobProcess, Outcome
 
 log = logging.getLogger("attentionvote.multirun")
 Compose = Callable[[Sequence[str]], DictConfig]
@@ -92,8 +94,7 @@ def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurat
     first = configurations[0]
     if OmegaConf.select(first, "tracking.parent", default=0) == 0:
         return None
-    from training_job import NOT_IDENTITY
-
+    from attentionvote.command.identity import NOT_IDENTITY
     from attentionvote.tracking.group_run import open_group
 
     contents = []

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from hardware import cores
 from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.execution import Executor, executor_named
+from attentionvote.execution.hardware import cores
 
 
 def executor_of(cfg: DictConfig) -> Executor:

@@ -1,0 +1,1 @@
+"""The frame of every verb: entry, configuration, grid, executors, errors."""

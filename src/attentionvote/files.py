@@ -1,0 +1,102 @@
+"""Files and folders that survive a kill: written whole or not at all, one process a folder, one cache folder."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+log = logging.getLogger("attentionvote.files")
+
+
+class FolderUnavailable(ValueError):
+    """A folder for results cannot be written, or another process works in it; the message is one sentence."""
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text; its folder is made."""
+    whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8", newline=""))
+
+
+def whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Have ``write`` make a file under another name of the same kind, and give it its own; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk, where they survive a power cut."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file whole or not at all."""
+    write_whole(path, json.dumps(content, indent=2) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The object in a JSON file; None when there is no such file, or, with a warning, when it is damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        content = None
+    if not isinstance(content, dict):
+        log.warning("%s is damaged and is passed over", path)
+        return None
+    return content
+
+
+@contextmanager
+def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs") -> Iterator[None]:
+    """Make the folder and be the only process in it.
+
+    Args:
+        folder: created when missing.
+        outputs: the setting's value, for the sentence when it cannot be written.
+        work: what is done there, for the sentence when another process does it.
+        setting: its name.
+
+    Raises:
+        FolderUnavailable: when the folder cannot be written, or another process is in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise FolderUnavailable(f"{setting}={outputs} cannot be written: {error.strerror or error}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, also on kill -9
+        except BlockingIOError as error:
+            raise FolderUnavailable(f"another process is at this {work} ({folder}): wait for it, or end it") from error
+        yield
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process is in the folder; False when there is no such folder."""
+    try:
+        lock = (folder / ".lock").open("r+")
+    except OSError:
+        return False
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
