@@ -152,7 +152,6 @@ lint: $(STAMP) ## Check style, types and import directions
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
 	@$(PY) -m mypy
-	@MYPYPATH=src:pipelines $(PY) -m mypy pipelines
 	@$(VENV)/bin/lint-imports --no-logo
 
 format: $(STAMP) ## Rewrite the sources in the project's style

@@ -22,10 +22,10 @@ log = logging.getLogger("attentionvote.evaluate")
 
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Measure, record, show; the figures."""
-    from evaluation_job import EvaluationJob, is_recorded
-    from evaluation_report import described, record, show
-
     from attentionvote.files import locked_folder
+    from attentionvote.workflows.evaluate.frozen_set import is_recorded
+    from attentionvote.workflows.evaluate.job import EvaluationJob
+    from attentionvote.workflows.evaluate.report import described, record, show
 
     with configuring():
         job = EvaluationJob.find(cfg)

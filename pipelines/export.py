@@ -18,7 +18,7 @@ from attentionvote.command.entry import command, configuring
 
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Export, prove, sign; where the bundle is and what the proof measured."""
-    from export_job import ExportJob
+    from attentionvote.workflows.export import ExportJob
 
     with configuring():
         job = ExportJob.find(cfg)

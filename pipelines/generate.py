@@ -28,13 +28,15 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     """Generate every asked-for split; digests and counts per split."""
     from hydra.utils import instantiate
 
-    from attentionvote.simulation import generate_scene_set, scene_set_directory, scene_set_specs
+    from attentionvote.simulation.scene_set import generate_scene_set
+    from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
 
     start = time.monotonic()
     with configuring(f"object {cfg.object.name}"):
         part = instantiate(cfg.object)
     with configuring():
-        specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation))
+        simulation: Any = OmegaConf.to_container(cfg.simulation)
+        specs = scene_set_specs(part, simulation)
         executor = executor_of(cfg)
     unknown = [split for split in cfg.splits if split not in specs]
     if unknown or not cfg.splits:

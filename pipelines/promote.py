@@ -17,7 +17,7 @@ from attentionvote.command.entry import command, configuring
 
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Measure, judge, register, move; the decision."""
-    from promotion_job import PromotionJob
+    from attentionvote.workflows.promote import PromotionJob
 
     with configuring():
         job = PromotionJob.find(cfg)

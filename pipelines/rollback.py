@@ -22,11 +22,10 @@ log = logging.getLogger("attentionvote.rollback")
 
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Choose, check, move; what is champion now."""
-    from evaluation_job import trusted_key
-
     from attentionvote.registry.history import History
     from attentionvote.registry.promotion import Superseded, move, stand, target
     from attentionvote.registry.versions import Versions
+    from attentionvote.workflows.evaluate.job import trusted_key
 
     with configuring():
         key = trusted_key(cfg.trusted_key)

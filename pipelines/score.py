@@ -19,7 +19,7 @@ EXAMPLES = {"gt": "gt=test/gt", "results": "results=out/results"}
 
 def run(cfg: DictConfig) -> dict[str, Any]:
     """Recognise the format, score, show the table; the figures."""
-    from score_report import show
+    from attentionvote.workflows.score.report import show
 
     for name, example in EXAMPLES.items():
         if not cfg[name]:
@@ -28,9 +28,9 @@ def run(cfg: DictConfig) -> dict[str, Any]:
             raise ConfigurationError(f"{name} must be a file or folder that is there, got {cfg[name]}")
     with configuring():
         if _is_bop(cfg):
-            from score_bop import scored
+            from attentionvote.workflows.score.bop import scored
         else:
-            from score_sileane import scored
+            from attentionvote.workflows.score.sileane import scored
         result = scored(cfg)
     show(result)
     return {"stage": "score", "gt": cfg.gt, "results": cfg.results, **result}

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from train import preset_of_workers
 
 from attentionvote.command.conf_folder import choices, primary_groups
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.words import words_beside, words_of
+from attentionvote.workflows.train.preset import preset_of_workers
 
 _PLACE = ("executor", "cluster")  # settings that say where trials run
 
@@ -30,10 +30,9 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
         cfg: the sweep's configuration.
         words: it was composed of, the machine's default included; those of the training are handed on to the trials.
     """
-    from sweep_job import SweepJob
-    from sweep_report import check_save_as
-
     from attentionvote.files import locked_folder
+    from attentionvote.workflows.sweep.job import SweepJob
+    from attentionvote.workflows.sweep.report import check_save_as
 
     check_save_as(cfg.save_as, words=words)
     with configuring():
@@ -63,7 +62,7 @@ def _space_name(words: Sequence[str]) -> str:
 
 def check(cfg: DictConfig) -> None:
     """What a grid of sweeps asks of each before the first starts."""
-    from sweep_space import parse_space
+    from attentionvote.workflows.sweep.space import parse_space
 
     parse_space(_plain(cfg.sweep.space), cfg)
 

@@ -14,17 +14,14 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
-from collections.abc import Sequence
 from contextlib import nullcontext
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
-from training_processes import Place, be_silent, failing_at_once, first_speaks, refuse_grid
 
 from attentionvote.command.entry import command, configuring
+from attentionvote.workflows.train.preset import preset_of_hardware
+from attentionvote.workflows.train.processes import Place, failing_at_once, first_speaks
 
 log = logging.getLogger("attentionvote.train")
 
@@ -37,7 +34,7 @@ def run(cfg: DictConfig) -> dict[str, Any] | None:
 
 
 def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
-    from training_job import find_training
+    from attentionvote.workflows.train.job import find_training
 
     with configuring(f"object {cfg.object.name}"):
         job = find_training(cfg)
@@ -54,10 +51,7 @@ def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
                     "this training is complete, made at commit %s (force=true repeats it): %s", commit, job.directory
                 )
             return result
-        from lightning_import import import_lightning
-
-        import_lightning()
-        from training_run import TrainingRun
+        from attentionvote.workflows.train.run import TrainingRun
 
         with configuring():
             training = TrainingRun(cfg, job, place, first_does)
@@ -68,44 +62,9 @@ def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
 
 def check(cfg: DictConfig) -> None:
     """What a grid asks of every job before the first starts: the parts of its configuration fit together."""
-    from training_job import find_training
+    from attentionvote.workflows.train.job import find_training
 
     find_training(cfg)
-
-
-def preset_of_hardware(words: list[str]) -> list[str]:
-    """``experiment=gpu`` where torch can use a GPU, else ``experiment=compact``, unless the user named one.
-
-    Told without importing torch: an NVIDIA driver is loaded, not hidden from us, and torch is no CPU build.
-    """
-    place = Place.of(os.environ)
-    refuse_grid(place, sys.argv)
-    if place.local_rank:
-        be_silent()  # what is wrong with the words is said once a machine
-    if any(word.lstrip("+~").startswith("experiment") for word in words):
-        return []
-    preset, reason = "compact", "no GPU was found"
-    if Path("/proc/driver/nvidia/version").exists():
-        preset, reason = "gpu", "a GPU was found"
-        if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
-            preset, reason = "compact", "CUDA_VISIBLE_DEVICES hides the GPU"
-        elif version("torch").endswith("+cpu"):
-            preset, reason = "compact", "torch is a CPU build"
-    if place.rank == 0:
-        log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
-    return [f"experiment={preset}"]
-
-
-def preset_of_workers(cfg: DictConfig, words: Sequence[str]) -> list[str]:
-    """The preset of the machines that train: of this one, or on a cluster what the jobs are given.
-
-    The machine that submits says nothing about those that train: a cluster's jobs have a GPU when they ask for one.
-    """
-    if cfg.executor == "local" or any(word.lstrip("+~").startswith("experiment") for word in words):
-        return preset_of_hardware(list(words))
-    preset = "gpu" if cfg.cluster.gpus > 0 else "compact"
-    log.info("experiment=%s, because cluster.gpus=%s (experiment=... chooses another)", preset, cfg.cluster.gpus)
-    return [f"experiment={preset}"]
 
 
 if __name__ == "__main__":

@@ -123,7 +123,9 @@ def test_only_pipelines_knows_hydra_and_no_library_imports_its_scripts() -> None
 
 
 def test_every_verb_has_one_stem_everywhere() -> None:
-    verbs = {p.stem for p in SCRIPTS if "from attentionvote.command.entry import command" in p.read_text(encoding="utf-8")}
+    verbs = {
+        p.stem for p in SCRIPTS if "from attentionvote.command.entry import command" in p.read_text(encoding="utf-8")
+    }
     targets = {
         line.split(":")[0] for line in (ROOT / "Makefile").read_text(encoding="utf-8").splitlines() if ": $(" in line
     }

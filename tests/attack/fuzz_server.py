@@ -17,8 +17,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / name) for name in ("tests/fixtures", "src", "pipelines")]
 
-from bench_serve import server  # noqa: E402
 from scan_mutations import damaged_file  # noqa: E402
+
+from attentionvote.workflows.speed.serving import server  # noqa: E402
 
 _MOST_COUNT, _PROGRESS_S, _MOST_EXAMPLES = 10_000_000, 5.0, 20
 

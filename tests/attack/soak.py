@@ -27,11 +27,11 @@ sys.path[:0] = [str(ROOT / name) for name in ("tests/attack", "tests/fixtures", 
 
 import numpy as np  # noqa: E402
 from attackers import ATTACKS, child_processes, stopped_workers, swaps  # noqa: E402
-from bench_serve import Expected, expectations  # noqa: E402
 
 from attentionvote.inference.bundles.bundle import write_manifest  # noqa: E402
 from attentionvote.inference.bundles.signature import load_private_key, make_keys  # noqa: E402
 from attentionvote.inference.client import DeadlinePassed, PoseClient, PoseClientError, Unavailable  # noqa: E402
+from attentionvote.workflows.speed.serving import Expected, expectations  # noqa: E402
 
 LATEST_S = 3.0
 _WARM_S, _LOOK_S, _GROWTH = 20.0, 2.0, 1.25

@@ -13,7 +13,9 @@ from attentionvote.baselines import PpfDetector, PpfSettings, check_opencv
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.part import Part
-from attentionvote.simulation import Camera, PartCaster, load_part
+from attentionvote.simulation.camera import Camera
+from attentionvote.simulation.part_files import load_part
+from attentionvote.simulation.raycast import PartCaster
 
 COARSE = {"sampling": 0.08, "reference_step": 3, "hypotheses": 30}
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from attentionvote.data.clouds import Clouds, CloudSettings, measure_clouds
+from attentionvote.data.clouds import Clouds, measure_clouds
+from attentionvote.data.sensing import CloudSettings
 from attentionvote.model import Layout
 from attentionvote.part import Part
-from attentionvote.simulation import SceneSet, Sensor
+from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.simulation.sensor import Sensor
 
 SETTINGS = CloudSettings(Sensor("gaussian", sigma_mm=0.3), density=1500, pool=600, neighbors=12)
 

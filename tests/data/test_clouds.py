@@ -11,11 +11,15 @@ import pytest
 from numpy.typing import NDArray
 
 from attentionvote.data import cloud_pool
-from attentionvote.data.clouds import Clouds, CloudSettings, measure, measure_clouds
+from attentionvote.data.clouds import Clouds, measure_clouds
+from attentionvote.data.sensing import CloudSettings, measure
 from attentionvote.geometry.pose import apply
 from attentionvote.part import Part
 from attentionvote.scene import Scene
-from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_record import SceneRecord
+from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.simulation.sensor import Sensor
 
 
 def bits(clouds: Clouds) -> list[bytes]:

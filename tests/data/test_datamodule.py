@@ -9,11 +9,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from attentionvote.data import Augmentation, Batch, Clouds, CloudSettings, PartDataModule, measure_clouds
-from attentionvote.data.datamodule import EpochSampler, scene_share
+from attentionvote.data.clouds import Clouds, measure_clouds
+from attentionvote.data.datamodule import EpochSampler, PartDataModule, scene_share
+from attentionvote.data.samples import Augmentation, Batch
+from attentionvote.data.sensing import CloudSettings
 from attentionvote.model import Layout
 from attentionvote.part import Part
-from attentionvote.simulation import SceneSet
+from attentionvote.simulation.scene_set import SceneSet
 
 
 def module(clouds: Clouds, layout: Layout, workers: int = 0, seed: int = 3, batch_size: int = 2) -> PartDataModule:

@@ -12,14 +12,17 @@ import pytest
 from scipy.spatial import cKDTree
 from written_piles import pile_records, write_piles
 
-from attentionvote.data import CloudSettings, draw_sample, measure_clouds
-from attentionvote.data.clouds import sense
+from attentionvote.data.clouds import measure_clouds
 from attentionvote.data.dataset_split import DatasetSensing, DatasetSplit, check_sensor
 from attentionvote.data.nearest_surface import PartSurface
+from attentionvote.data.samples import draw_sample
+from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.datasets import Dataset, open_datasets
 from attentionvote.model import Layout
 from attentionvote.part import Part
-from attentionvote.simulation import PartCaster, SceneRecord, Sensor
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_record import SceneRecord
+from attentionvote.simulation.sensor import Sensor
 
 EXACT = CloudSettings(Sensor("none"), density=40_000, pool=40_000, neighbors=12)
 

@@ -16,7 +16,7 @@ from written_piles import pile_records, write_piles
 from attentionvote.data.dataset_splits import DatasetSplits
 from attentionvote.export import held_out
 from attentionvote.part import Part
-from attentionvote.simulation import Sensor
+from attentionvote.simulation.sensor import Sensor
 
 SHARES = {"val": 0.2, "test": 0.4}
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from attentionvote.datasets import PinholeCamera
 from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part
-from attentionvote.simulation import Camera, PartCaster
-from attentionvote.simulation.raycast import BinSurface
+from attentionvote.simulation.camera import Camera
+from attentionvote.simulation.raycast import BinSurface, PartCaster
 
 CAMERA = Camera(120, 96, 200.0, 200.0, 57.0, 50.0)
 CAMERA_FROM_BIN = transform(np.diag([1.0, -1.0, -1.0]), (0.01, -0.02, 0.9))

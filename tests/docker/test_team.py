@@ -20,9 +20,9 @@ from typing import Any
 
 import pytest
 
-from attentionvote import tracking
 from attentionvote.inference import load_bundle
 from attentionvote.registry.versions import Versions
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
 from attentionvote.tracking.store import connect
 
@@ -232,7 +232,7 @@ def test_runs_versions_and_their_files_go_through_it_and_come_back_from_a_backup
     team: Team, person: str, cell: Any, postgresql: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "last.ckpt").write_bytes(b"weights")
-    with tracking.start_run(team.url, "bracket", params={"lr": 1}, system_interval_s=0) as run:
+    with start_run(team.url, "bracket", params={"lr": 1}, system_interval_s=0) as run:
         run.log_metrics({"val/ap_10": 0.9}, 0)
         run.log_file("checkpoints/last.ckpt", tmp_path / "last.ckpt")
         assert run.flush(60)

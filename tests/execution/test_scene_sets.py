@@ -13,13 +13,16 @@ import psutil
 import pytest
 from scipy.spatial import ConvexHull
 
-from attentionvote.data import CloudSettings, measure_clouds
+from attentionvote.data.clouds import measure_clouds
+from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution import Executor, RayCluster
 from attentionvote.part import Part
-from attentionvote.simulation import SceneSet, Sensor, cycle_pool, generate_scene_set, scene_set
+from attentionvote.simulation import cycle_pool, scene_set
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop import DropSettings
+from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import SceneSetSpec
+from attentionvote.simulation.sensor import Sensor
 
 pytestmark = pytest.mark.slow
 

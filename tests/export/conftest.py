@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
-from attentionvote.export import model_card
+from attentionvote.export.checkpoint_card import model_card
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
-from attentionvote.simulation import load_part
+from attentionvote.simulation.part_files import load_part
 from attentionvote.training.checkpoint import save_trained
 
 POINTS = 300

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from attentionvote.contract import ModelCard
-from attentionvote.export import export_graph
+from attentionvote.export.onnx_file import export_graph
 from attentionvote.training.checkpoint import load_trained
 
 paths = [Path(word) for word in sys.argv[1:]]

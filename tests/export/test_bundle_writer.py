@@ -15,7 +15,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
-from attentionvote.export import bundle_writer, write_bundle, write_triton
+from attentionvote.export import bundle_writer
+from attentionvote.export.bundle_writer import write_bundle
+from attentionvote.export.triton_layout import write_triton
 from attentionvote.inference import PoseEstimator, load_bundle
 from attentionvote.part import Part
 
@@ -131,8 +133,8 @@ import pathlib
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from attentionvote.contract import ModelCard
-from attentionvote.export import write_bundle
-from attentionvote.simulation import load_part
+from attentionvote.export.bundle_writer import write_bundle
+from attentionvote.simulation.part_files import load_part
 here = pathlib.Path(__file__).parent
 def write():
     card = ModelCard.from_json((here / "card.json").read_text())

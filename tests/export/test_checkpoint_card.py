@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from attentionvote.contract import ModelCard
-from attentionvote.export import model_card, used_otherwise
+from attentionvote.export.checkpoint_card import model_card, used_otherwise
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
 

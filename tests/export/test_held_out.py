@@ -12,11 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from attentionvote.data.clouds import sense
-from attentionvote.export import held_out, model_card
+from attentionvote.data.sensing import sense
+from attentionvote.export import held_out
+from attentionvote.export.checkpoint_card import model_card
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
-from attentionvote.simulation import PartCaster, SceneSet, scene_set, scene_set_directory, scene_set_specs
+from attentionvote.simulation import scene_set
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
 
 CAMERA = {"width": 344, "height": 257, "fx": 567.0, "fy": 567.0, "cx": 172.0, "cy": 128.5}
 SETTINGS: dict[str, Any] = {

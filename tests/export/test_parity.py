@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from attentionvote.data.samples import Batch, collate
 from attentionvote.evaluation import SceneResult
-from attentionvote.export import Limits, Parity, compare, measure_parity, table
+from attentionvote.export.parity import compare, measure_parity
+from attentionvote.export.parity_record import Limits, Parity, table
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.model import AttentionVote, find_neighborhoods
 from attentionvote.part import Part

@@ -22,9 +22,9 @@ def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from scipy.spatial import ConvexHull
 
     from attentionvote.command.configuration import compose
-    from attentionvote.simulation import load_part
     from attentionvote.simulation.cad import BUILTIN_PARTS
     from attentionvote.simulation.decomposition import cache_directory, hull_file
+    from attentionvote.simulation.part_files import load_part
 
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "parts-of-one-piece"

@@ -8,13 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from baseline_scenes import ppf_results
 
 from attentionvote.baselines import PpfSettings
-from attentionvote.data.clouds import CloudSettings, measure
+from attentionvote.data.sensing import CloudSettings, measure
+from attentionvote.measurement.baseline_scenes import ppf_results
 from attentionvote.part import Part
 from attentionvote.scene import Scene
-from attentionvote.simulation import PartCaster, SceneSet, Sensor
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.simulation.sensor import Sensor
 
 QUICK = PpfSettings(sampling=0.12, reference_step=4, hypotheses=10, score="fit", fit_distance=0.03)
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import bench
-import bench_rows
 import pytest
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import Refused
 from attentionvote.geometry import sampling_reference
+from attentionvote.workflows.speed import rows as bench_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["object=brick", "compact=['experiment=smoke']", "full=['experiment=smoke']", "rounds=2"]
@@ -67,7 +67,9 @@ def test_every_row_has_a_contest_and_a_name_of_its_own() -> None:
     assert len({row.name for row in bench_rows.ROWS}) == len(bench_rows.ROWS)
     for row in bench_rows.ROWS:
         module, _, function = row.prepare.partition(":")
-        text = (ROOT / "pipelines" / f"{module}.py").read_text()  # not imported: onnxruntime and the exporter are slow
+        text = (
+            ROOT / "src/attentionvote/workflows/speed" / f"{module}.py"
+        ).read_text()  # not imported: onnxruntime and the exporter are slow
         assert f"\ndef {function}(material: Material" in text, row.name
     assert bench_rows.chosen("normals, ball-query") == [bench_rows.ROWS[1], bench_rows.ROWS[2]]
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bench_report import keep, kept_rows, markdown
+
+from attentionvote.workflows.speed.report import keep, kept_rows, markdown
 
 
 def measured(met: bool | None, commit: str, **changes: Any) -> dict[str, Any]:

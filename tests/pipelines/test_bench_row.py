@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 
 import pytest
-from bench_row import Contest, Goal, Row, Unequal, measure
+
+from attentionvote.workflows.speed.contest import Contest, Goal, Row, Unequal, measure
 
 
 def busy(seconds: float, log: list[str], name: str) -> Callable[[], str]:

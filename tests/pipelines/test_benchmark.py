@@ -11,13 +11,13 @@ from typing import Any
 
 import benchmark
 import pytest
-from export_job import ExportJob
-from training_job import find_training
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import write_json
 from attentionvote.inference import load_bundle
+from attentionvote.workflows.export import ExportJob
+from attentionvote.workflows.train.job import find_training
 
 ROOT = Path(__file__).resolve().parents[2]
 # One cycle of two scenes with a few bricks.
@@ -120,9 +120,10 @@ def test_what_cannot_be_is_said_before_any_work(tmp_path: Path, words: list[str]
 @pytest.mark.parametrize("known", ["", "frozen: {zebra: abc}\n"])
 def test_the_frozen_scenes_are_recorded_by_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
     """And an evaluation on scenes with another digest says so."""
-    from evaluation_job import generated_set, is_recorded, set_spec
     from hydra.utils import instantiate
     from omegaconf import OmegaConf
+
+    from attentionvote.workflows.evaluate.frozen_set import generated_set, is_recorded, set_spec
 
     recorded = tmp_path / "benchmark.yaml"
     recorded.write_text(f"# why\ndefaults:\n- default\nsplit: benchmark\n{known}")

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmark_page import draw, markdown, put
-from benchmark_table import BenchmarkTable, Curve, PaperRow, Row
+
+from attentionvote.workflows.page_sections import put
+from attentionvote.workflows.tables.page import draw, markdown
+from attentionvote.workflows.tables.table import BenchmarkTable, Curve, PaperRow, Row
 
 TABLE = BenchmarkTable(
     "table_0",

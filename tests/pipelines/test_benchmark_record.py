@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 
 import pytest
-from benchmark_cells import CellFailed, cells_of_parts
-from benchmark_page import markdown, put
-from benchmark_record import BenchmarkRecord
-from benchmark_table import BenchmarkTable
 from omegaconf import OmegaConf
 
 from attentionvote.command.configuration import compose
+from attentionvote.workflows.page_sections import put
+from attentionvote.workflows.tables.cells import CellFailed, cells_of_parts
+from attentionvote.workflows.tables.page import markdown
+from attentionvote.workflows.tables.record import BenchmarkRecord
+from attentionvote.workflows.tables.table import BenchmarkTable
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 

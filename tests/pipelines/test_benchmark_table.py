@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 import yaml
-from benchmark_table import BenchmarkTable, mean, title_of
 from omegaconf import OmegaConf
 
 from attentionvote.command.conf_folder import CONF, choices
 from attentionvote.command.configuration import compose
+from attentionvote.workflows.tables.table import BenchmarkTable, mean, title_of
 
 NAMES = sorted(path.stem for path in (CONF / "table").glob("*.yaml"))
 

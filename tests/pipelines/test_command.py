@@ -16,12 +16,15 @@ from attentionvote.command.entry import configuring
 from attentionvote.command.errors import ConfigurationError
 
 PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
-REAL_VERBS = sorted(p.stem for p in PIPELINES.glob("*.py") if "from attentionvote.command.entry import command" in p.read_text(encoding="utf-8"))
+REAL_VERBS = sorted(
+    p.stem
+    for p in PIPELINES.glob("*.py")
+    if "from attentionvote.command.entry import command" in p.read_text(encoding="utf-8")
+)
 SCRIPT = '''
 """A verb that does what it is told."""
 import logging, os, sys, time
 from pathlib import Path
-sys.path.insert(0, {pipelines!r})
 from attentionvote.command.entry import command, configuring
 log = logging.getLogger("attentionvote.fake")
 def run(cfg):
@@ -52,7 +55,7 @@ def verb(tmp_path: Path) -> Path:
     (tmp_path / "conf" / "fake.yaml").write_text(primary, encoding="utf-8")
     (tmp_path / "conf" / "object" / "gear.yaml").write_text("name: gear\n", encoding="utf-8")
     script = tmp_path / "fake.py"
-    script.write_text(SCRIPT.format(pipelines=str(PIPELINES), conf=str(tmp_path / "conf")), encoding="utf-8")
+    script.write_text(SCRIPT.format(conf=str(tmp_path / "conf")), encoding="utf-8")
     return script
 
 

@@ -153,7 +153,7 @@ ABLATIONS = [
 
 @pytest.mark.parametrize("words", ABLATIONS, ids=" ".join)
 def test_the_ablations_of_the_benchmarks_are_trainings(words: list[str]) -> None:
-    from training_job import find_training
+    from attentionvote.workflows.train.job import find_training
 
     plain = ["object=connecting_rod", "experiment=compact"]
     job, base = (find_training(compose("train", [*plain, *more])) for more in (words, []))
@@ -173,7 +173,7 @@ def test_there_are_ablations_in_the_benchmarks() -> None:
     ],
 )
 def test_thresholds_that_no_farthest_vote_passes_are_refused(words: list[str], message: str) -> None:
-    from training_job import find_training
+    from attentionvote.workflows.train.job import find_training
 
     cfg = compose("train", ["object=connecting_rod", "experiment=votenet", *words])
     with pytest.raises(ValueError, match=message) if message else nullcontext():

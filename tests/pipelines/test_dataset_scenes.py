@@ -11,13 +11,13 @@ import evaluate
 import numpy as np
 import pytest
 import write_data
-from dataset_scenes import DatasetScenes
-from evaluation_job import EvaluationJob
 from hydra.utils import instantiate
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.data.dataset_split import DatasetSplit
+from attentionvote.measurement.dataset_scenes import DatasetScenes
+from attentionvote.workflows.evaluate.job import EvaluationJob
 
 WRITTEN = ["object=brick", "simulation=smoke", "simulation.drop_counts=[2,5]", "split=test", "workers=1"]
 

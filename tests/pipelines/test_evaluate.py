@@ -7,9 +7,9 @@ import json
 import evaluate
 import pytest
 
-from attentionvote import tracking
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect
 
 
@@ -25,7 +25,7 @@ def run(few_scenes):
 
 def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_brick, put_tables, tmp_path, capsys):
     store = put_tables(tmp_path / "mlflow.db")
-    with tracking.start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
+    with start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
         pass
     bundle = export_brick("model", training.id)
     result = run(f"tracking.store={store}")
@@ -55,7 +55,7 @@ def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_
 
 def test_another_peak_threshold_is_another_evaluation_and_not_the_runs_figures(run, export_brick, put_tables, tmp_path):
     store = put_tables(tmp_path / "mlflow.db")
-    with tracking.start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
+    with start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
         pass
     export_brick("model", training.id)
     usual = run(f"tracking.store={store}")

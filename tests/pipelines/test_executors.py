@@ -6,12 +6,12 @@ from pathlib import Path
 
 import generate
 import pytest
-from training_job import find_training
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.command.executors import executor_of
 from attentionvote.execution import LocalPool, RayCluster, SlurmArray
+from attentionvote.workflows.train.job import find_training
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]
 

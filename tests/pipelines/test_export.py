@@ -45,7 +45,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scenes of bricks and a training of a small network that votes near its seeds."""
     from dataclasses import asdict
 
-    from attentionvote.simulation import SceneSet, load_part
+    from attentionvote.simulation.part_files import load_part
+    from attentionvote.simulation.scene_set import SceneSet
 
     folder = tmp_path_factory.mktemp("trained")
     done = python("generate.py", *SCENES, "splits=[test]", "workers=1", folder=folder)
@@ -106,13 +107,13 @@ def test_a_training_becomes_a_bundle_that_a_cell_trusts(trained: Path, exported:
 @pytest.fixture
 def again(trained: Path, exported: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
     """The verb in this process, where the training was; tracing again is an error."""
-    import attentionvote.export
+    import attentionvote.export.onnx_file
 
     def never(*_: object) -> bytes:
         raise AssertionError("traced again")
 
     monkeypatch.chdir(trained)
-    monkeypatch.setattr(attentionvote.export, "export_graph", never)
+    monkeypatch.setattr(attentionvote.export.onnx_file, "export_graph", never)
     words = [*EXPORT, f"signing_keys={trained}/keys"]
     assert exported["stage"] == "export"
     return lambda *more: export.run(compose("export", [*words, *more]))
@@ -171,7 +172,7 @@ def test_over_the_limits_only_the_report_is_written(
     trained: Path, exported: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The graph of one network cannot pass for another: the checkpoint is changed after its export."""
-    import attentionvote.export
+    import attentionvote.export.onnx_file
 
     stored = load_bundle(trained / exported["bundle"], None).model
     training = tmp_path / "train" / "brick" / "abcdefabcdef"
@@ -182,7 +183,7 @@ def test_over_the_limits_only_the_report_is_written(
             refiner.output.bias[:3] += 0.2  # type: ignore[index, union-attr]
     save_trained(model, metadata, training / "model.ckpt")
     (training / "result.json").write_text(json.dumps({"run_id": "f00d", "commit": ""}), encoding="utf-8")
-    monkeypatch.setattr(attentionvote.export, "export_graph", lambda *_: stored)
+    monkeypatch.setattr(attentionvote.export.onnx_file, "export_graph", lambda *_: stored)
     words = [f"root={trained}/data", f"trained={tmp_path}/train", f"outputs={tmp_path}/export"]
     cfg = compose("export", [*EXPORT, *words, f"signing_keys={trained}/keys"])
     with pytest.raises(ValueError, match=r"must be equal within the limits, but CPU: .*the report is"):
@@ -221,7 +222,7 @@ def test_a_training_that_cannot_be_meant_is_one_sentence(two_trainings: list[str
 def test_the_newest_of_several_trainings_is_taken_and_the_others_are_named(
     two_trainings: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from export_job import ExportJob
+    from attentionvote.workflows.export import ExportJob
 
     older = tmp_path / "train" / "brick" / "aaaa33334444" / "result.json"
     older.write_text(json.dumps({"run_id": "cafe2", "metrics": {"ap_10": 0.9, "ap_5": 0.8, "ap_2": 0.25}}))
@@ -233,14 +234,14 @@ def test_the_newest_of_several_trainings_is_taken_and_the_others_are_named(
 
 
 def test_a_damaged_training_is_passed_over(two_trainings: list[str], tmp_path: Path) -> None:
-    from export_job import ExportJob
+    from attentionvote.workflows.export import ExportJob
 
     (tmp_path / "train" / "brick" / "aaaa11112222" / "result.json").write_text("", encoding="utf-8")
     assert ExportJob.find(compose("export", two_trainings)).training.name == "aaaa33334444"
 
 
 def test_one_process_exports_a_part(two_trainings: list[str]) -> None:
-    from export_job import ExportJob
+    from attentionvote.workflows.export import ExportJob
 
     job = ExportJob.find(compose("export", two_trainings))
     refused = pytest.raises(ConfigurationError, match="another process is at this part's export")
@@ -255,7 +256,7 @@ def test_a_place_that_cannot_be_written_is_said_first(two_trainings: list[str], 
 
 
 def test_a_lost_public_key_comes_back(two_trainings: list[str], tmp_path: Path) -> None:
-    from export_job import ExportJob
+    from attentionvote.workflows.export import ExportJob
 
     ExportJob.find(compose("export", two_trainings))
     public = tmp_path / "keys" / "signing.pub"
@@ -266,7 +267,7 @@ def test_a_lost_public_key_comes_back(two_trainings: list[str], tmp_path: Path) 
 
 
 def test_a_run_is_named_by_the_beginning_of_its_id_or_folder(two_trainings: list[str]) -> None:
-    from export_job import ExportJob
+    from attentionvote.workflows.export import ExportJob
 
     find: Callable[[str], Path] = lambda word: ExportJob.find(compose("export", [*two_trainings, word])).training  # noqa: E731
     assert find("run=cafe1").name == "aaaa11112222"

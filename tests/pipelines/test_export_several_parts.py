@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 import torch
 from hydra.utils import instantiate
-from several_parts import described, network_arguments
 
 from attentionvote.command.configuration import compose
 from attentionvote.evaluation.by_part import COUNTS
 from attentionvote.inference import PoseEstimator, load_bundle
 from attentionvote.model import AttentionVote
 from attentionvote.part import PartSet
-from attentionvote.simulation import SceneSet
+from attentionvote.simulation.scene_set import SceneSet
 from attentionvote.training.checkpoint import save_trained
+from attentionvote.workflows.train.network import described, network_arguments
 
 ROOT = Path(__file__).resolve().parents[2]
 OBJECT = ["object=industrial", "~object.parts.vertical_bearing_pedestal"]

@@ -13,11 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import fleet
-import fleet_board
 import pytest
-from export_job import ExportJob
-from train import preset_of_workers
-from training_job import find_training
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -26,7 +22,12 @@ from attentionvote.files import write_json
 from attentionvote.registry.history import History
 from attentionvote.registry.promotion import move, stand
 from attentionvote.registry.versions import Versions
-from attentionvote.simulation import generate_scene_set, scene_set_directory
+from attentionvote.simulation.scene_set import generate_scene_set
+from attentionvote.simulation.scene_spec import scene_set_directory
+from attentionvote.workflows.export import ExportJob
+from attentionvote.workflows.fleet import board as fleet_board
+from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.preset import preset_of_workers
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-from fleet_member import VERBS, MemberTask
 
 from attentionvote.execution.job_process import handed_on
+from attentionvote.workflows.chain import VERBS, MemberTask
 
 # Stands for every verb: keeps what it was told, and its tracking user.
 VERB = """

@@ -10,32 +10,29 @@ from pathlib import Path
 
 import pytest
 
-PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
 # Stands for every verb: notes its words, ends its worker at the first training of the gear, fails at the rod's export.
-VERB = f"""
+VERB = """
 import json, os, signal, sys, time
-sys.path.insert(0, {str(PIPELINES)!r})
 from pathlib import Path
-from job_process import join_starter, report_failure
+from attentionvote.execution.job_process import join_starter, report_failure
 starter = os.getppid()
 join_starter()
 verb, part, notes = Path(sys.argv[0]).stem, sys.argv[1].partition("=")[2], Path(sys.argv[0]).parent / "notes"
-first = not notes.exists() or f"{{verb}} {{part}}" not in notes.read_text()
-with notes.open("a") as file: file.write(f"{{verb}} {{part}} {{' '.join(sys.argv[2:])}}\\n")
+first = not notes.exists() or f"{verb} {part}" not in notes.read_text()
+with notes.open("a") as file: file.write(f"{verb} {part} {' '.join(sys.argv[2:])}\\n")
 print("at work", file=sys.stderr)
 if (verb, part) == ("train", "gear") and first: os.kill(starter, signal.SIGKILL); time.sleep(60)
 if (verb, part) == ("export", "rod"): report_failure("no disk"); sys.exit(1)
-print(json.dumps({{"stage": verb, "run_id": f"run-of-{{part}}", "bundle": f"outputs/export/{{part}}/abc"}}))
+print(json.dumps({"stage": verb, "run_id": f"run-of-{part}", "bundle": f"outputs/export/{part}/abc"}))
 """
-FLEET = f"""
+FLEET = """
 import json, sys
 from pathlib import Path
-sys.path.insert(0, {str(PIPELINES)!r})
-from fleet import _run
-from fleet_member import MemberTask
+from attentionvote.workflows.fleet.job import _run
+from attentionvote.workflows.chain import MemberTask
 from attentionvote.execution import RayCluster
 folder = Path(sys.argv[1])
-task = MemberTask({{"train": ("seed=3",), "export": ("root=d",), "evaluate": ()}}, folder / "logs", folder)
+task = MemberTask({"train": ("seed=3",), "export": ("root=d",), "evaluate": ()}, folder / "logs", folder)
 print(json.dumps(_run(task, ["gear", "rod"], RayCluster(), 2, 1, 1)))
 """
 

@@ -59,8 +59,7 @@ def test_impossible_requests_write_nothing(tmp_path: Path, override: str, messag
 def test_the_presets_are_valid_and_spell_out_the_defaults(simulation: str) -> None:
     from omegaconf import OmegaConf
 
-    from attentionvote.simulation import scene_set_specs
-    from attentionvote.simulation.scene_spec import SceneSetSpec
+    from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
 
     cfg = compose("generate", ["object=brick", f"simulation={simulation}"])
     part = Part("box", np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]), 1.0)

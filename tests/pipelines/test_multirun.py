@@ -14,15 +14,13 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from attentionvote import tracking
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, resolve_store
 
-PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
 SCRIPT = '''
 """A verb that does what it is told."""
 import json, os, signal, sys, time
 from pathlib import Path
-sys.path.insert(0, {pipelines!r})
 from attentionvote.command.entry import command, configuring
 def run(cfg):
     print("a library prints")
@@ -55,7 +53,7 @@ def verb(tmp_path: Path) -> Path:
     for name in ("gear", "brick"):
         (tmp_path / "conf" / "object" / f"{name}.yaml").write_text(f"name: {name}\n", encoding="utf-8")
     script = tmp_path / "fake.py"
-    script.write_text(SCRIPT.format(pipelines=str(PIPELINES), conf=str(tmp_path / "conf")), encoding="utf-8")
+    script.write_text(SCRIPT.format(conf=str(tmp_path / "conf")), encoding="utf-8")
     return script
 
 
@@ -177,7 +175,7 @@ def test_runs_stand_below_one_parent_that_is_found_again(
     conf = tmp_path / "conf" / "fake.yaml"
     conf.write_text(conf.read_text(encoding="utf-8").replace("store: null", "store: null, parent: null"))
     for part in ("gear", "brick"):  # runs that are there already, as of trainings that are complete
-        with tracking.start_run(store, part, system_interval_s=0) as run:
+        with start_run(store, part, system_interval_s=0) as run:
             (tmp_path / f"run-{part}").write_text(run.id)
     words = ["object=gear,brick", f"tracking.store={store}", "do=it"]
     done = call(verb, "-m", *words)

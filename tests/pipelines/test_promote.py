@@ -16,11 +16,11 @@ import promote
 import pytest
 import rollback
 
-from attentionvote import tracking
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.registry.versions import Versions
+from attentionvote.tracking.run_opening import start_run
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,7 +38,7 @@ def model(export_brick, store, work_tree):
     """Exports a model that a training in the store made."""
 
     def make(name: str, **changes):
-        with tracking.start_run(store, "brick", config_yaml="a: 1", repository=work_tree, system_interval_s=0) as run:
+        with start_run(store, "brick", config_yaml="a: 1", repository=work_tree, system_interval_s=0) as run:
             pass
         return export_brick(name, run.id, run.commit, **changes)
 

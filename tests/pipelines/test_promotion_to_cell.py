@@ -19,9 +19,9 @@ import promote
 import pytest
 import rollback
 
-from attentionvote import tracking
 from attentionvote.command.configuration import compose
 from attentionvote.inference.client.pose_client import PoseClient
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import serve
 
 
@@ -92,9 +92,7 @@ def test_a_running_cell_follows_promotion_and_rollback_and_outlives_the_registry
     with serve(local) as server:
 
         def made_by_a_training(name: str):
-            with tracking.start_run(
-                server.url, "brick", config_yaml="a: 1", repository=work_tree, system_interval_s=0
-            ) as run:
+            with start_run(server.url, "brick", config_yaml="a: 1", repository=work_tree, system_interval_s=0) as run:
                 pass
             return export_brick(name, run.id, run.commit)
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 from omegaconf import OmegaConf
-from several_parts import check_classes, described, network_arguments
 
 from attentionvote.part import Part, PartSet, only_part
+from attentionvote.workflows.train.network import check_classes, described, network_arguments
 
 MODEL = OmegaConf.create({"_target_": "network", "classes": 1, "merge_fraction": 0.08, "head": [16]})
 

@@ -15,15 +15,15 @@ import optuna
 import pytest
 import sweep
 from optuna.trial import TrialState
-from sweep_job import SweepJob
-from sweep_report import MARK, check_save_as, experiment_text
-from training_job import find_training
 
-from attentionvote import tracking
 from attentionvote.command.conf_folder import CONF
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, resolve_store
+from attentionvote.workflows.sweep.job import SweepJob
+from attentionvote.workflows.sweep.report import MARK, check_save_as, experiment_text
+from attentionvote.workflows.train.job import find_training
 
 ROOT = Path(__file__).resolve().parents[2]
 EPOCHS = 4
@@ -60,7 +60,7 @@ def run(words: list[str]) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp_path: Path) -> None:
-    tracking.start_run(str(tmp_path / "mlflow.db"), "warm", system_interval_s=0).close()
+    start_run(str(tmp_path / "mlflow.db"), "warm", system_interval_s=0).close()
     command = [sys.executable, "pipelines/sweep.py", *words]
     process = subprocess.Popen([*command, "trials=1"], cwd=ROOT, text=True, stdout=-1, stderr=-1)
     job = sweep_of(words)

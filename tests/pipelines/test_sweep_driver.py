@@ -14,25 +14,24 @@ from typing import Any
 
 import pytest
 from optuna.trial import TrialState
-from sweep_driver import SweepDriver
-from sweep_space import Setting
-from sweep_study import Ledger, open_study
 
-PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
+from attentionvote.workflows.sweep.driver import SweepDriver
+from attentionvote.workflows.sweep.space import Setting
+from attentionvote.workflows.sweep.study import Ledger, open_study
+
 SPACE = [Setting("x", "float", 0.0, 1.0)]
 # Stands for a training: notes its start and end, and does what the test says of its number.
-JOB = f"""
+JOB = """
 import json, os, signal, sys, time
-sys.path.insert(0, {str(PIPELINES)!r})
 from pathlib import Path
-from job_process import join_starter, report_failure
+from attentionvote.execution.job_process import join_starter, report_failure
 join_starter()
 number = json.loads(os.environ["ATTENTIONVOTE_TRIAL"])["number"]
 folder, x = Path(sys.argv[1]), float(sys.argv[2])
 def note(what):
-    with (folder / "notes").open("a") as file: file.write(f"{{what}} {{number}} {{os.getpid()}} {{x}}\\n")
+    with (folder / "notes").open("a") as file: file.write(f"{what} {number} {os.getpid()} {x}\\n")
 note("start")
-times = (folder / "notes").read_text().count(f"start {{number}} ")
+times = (folder / "notes").read_text().count(f"start {number} ")
 does = json.loads((folder / "does.json").read_text()).get(str(number), "")
 try:
     if does == "wait": time.sleep(60)
@@ -40,15 +39,15 @@ try:
 except KeyboardInterrupt:
     note("interrupted"); sys.exit(130)
 if does == "crash" or (does == "crash once" and times == 1): os.kill(os.getpid(), signal.SIGKILL)
-if does == "fail": report_failure(f"the cloud must be finite, got {{os.getpid()}} NaN"); sys.exit(1)
+if does == "fail": report_failure(f"the cloud must be finite, got {os.getpid()} NaN"); sys.exit(1)
 if does == "prune": sys.exit(3)
 note("end")
-print(json.dumps({{"val_ap": None if does == "no score" else x, "metrics": {{"ap_10": 0.5}}}}))
+print(json.dumps({"val_ap": None if does == "no score" else x, "metrics": {"ap_10": 0.5}}))
 """
 # A sweep in a process of its own, to be killed.
 SWEEP = f"""
 import sys
-sys.path[:0] = [{str(PIPELINES)!r}, {str(Path(__file__).parent)!r}]
+sys.path[:0] = [{str(Path(__file__).parent)!r}]
 from test_sweep_driver import driver
 from pathlib import Path
 try: driver(Path(sys.argv[1]), int(sys.argv[3]))[1].run(int(sys.argv[2]), lambda: None)

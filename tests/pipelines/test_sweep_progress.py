@@ -8,8 +8,9 @@ import optuna
 import pytest
 from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
-from sweep_progress import SweepProgress
-from sweep_space import Setting
+
+from attentionvote.workflows.sweep.progress import SweepProgress
+from attentionvote.workflows.sweep.space import Setting
 
 SPACE = [Setting("trainer.learning_rate", "float", 0.0, 1.0)]
 

@@ -7,11 +7,11 @@ from typing import Any
 import optuna
 import pytest
 from omegaconf import DictConfig, OmegaConf
-from sweep_space import parse_space
 
 from attentionvote.command.conf_folder import CONF, choices
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.workflows.sweep.space import parse_space
 
 RATE = {"name": "trainer.learning_rate", "kind": "float", "low": 0.001, "high": 0.01, "log": True}
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 from optuna.trial import Trial, TrialState
-from sweep_space import Setting
-from sweep_study import Ledger, make_pruner, open_study, study_name
+
+from attentionvote.workflows.sweep.space import Setting
+from attentionvote.workflows.sweep.study import Ledger, make_pruner, open_study, study_name
 
 SPACE = [
     Setting("x", "float", 0.0, 1.0),

@@ -14,26 +14,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sweep_driver import SweepDriver
-from sweep_space import Setting
-from sweep_study import Ledger, open_study
-from trial_place import log_of, on_worker
 
 from attentionvote.execution import RayCluster
+from attentionvote.workflows.sweep.driver import SweepDriver
+from attentionvote.workflows.sweep.job import TRIAL_JOB
+from attentionvote.workflows.sweep.space import Setting
+from attentionvote.workflows.sweep.study import Ledger, open_study
+from attentionvote.workflows.sweep.trial_place import log_of, on_worker
 
-PIPELINES = Path(__file__).resolve().parents[2] / "pipelines"
 # Stands for a training: notes its start with its process, its parent and a variable; does what the test says of it.
-JOB = f"""
+JOB = """
 import json, os, signal, sys, time
-sys.path.insert(0, {str(PIPELINES)!r})
 from pathlib import Path
-from job_process import join_starter, report_failure
+from attentionvote.execution.job_process import join_starter, report_failure
 starter = os.getppid()
 join_starter()
 number = json.loads(os.environ["ATTENTIONVOTE_TRIAL"])["number"]
 folder, x = Path(sys.argv[1]), float(sys.argv[2])
 with (folder / "notes").open("a") as file:
-    file.write(f"{{number}} {{os.getpid()}} {{starter}} {{x}} {{os.environ.get('PGPASSWORD')}}\\n")
+    file.write(f"{number} {os.getpid()} {starter} {x} {os.environ.get('PGPASSWORD')}\\n")
 times = sum(line.split()[0] == str(number) for line in (folder / "notes").read_text().splitlines())
 does = json.loads((folder / "does.json").read_text()).get(str(number), "")
 print("epoch 1", file=sys.stderr)
@@ -42,12 +41,12 @@ if does == "crash once" and times == 1: os.kill(os.getpid(), signal.SIGKILL)
 if does == "end its worker once" and times == 1: os.kill(starter, signal.SIGKILL); time.sleep(60)
 if does == "fail": report_failure("the cloud must be finite, got 3 NaN"); sys.exit(1)
 if does == "prune": sys.exit(3)
-print(json.dumps({{"val_ap": x}}))
+print(json.dumps({"val_ap": x}))
 """
 # A sweep in a process of its own, with its own cluster of this machine; to be killed.
 SWEEP = f"""
 import sys
-sys.path[:0] = [{str(PIPELINES)!r}, {str(Path(__file__).parent)!r}]
+sys.path[:0] = [{str(Path(__file__).parent)!r}]
 from test_sweep_workers import sweep
 from pathlib import Path
 try: sweep(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
@@ -79,7 +78,7 @@ def sweep(folder: Path, executor: str, total: int) -> Ledger:
             heartbeat_s=1,
             logs=folder / "logs",
             ended=str,
-            script=PIPELINES / "trial_job.py",
+            script=TRIAL_JOB,
         ).run(total, lambda: None)
     return ledger
 

@@ -25,10 +25,10 @@ import torch
 import train
 from tiny_training import TINY_TRAINING
 
-from attentionvote import tracking
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.tracking import figures, scene_pictures
+from attentionvote.drawing import figures, scene_pictures
+from attentionvote.tracking.run_opening import start_run
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [
@@ -260,7 +260,7 @@ def test_an_end_without_validation_keeps_the_last_weights(words: list[str]) -> N
 
 
 def test_one_process_a_training(words: list[str], verb: Verb) -> None:
-    from training_job import find_training
+    from attentionvote.workflows.train.job import find_training
 
     with find_training(compose("train", words)).locked():
         process = verb(words)
@@ -329,7 +329,7 @@ def test_killed_anywhere_and_continued_ends_the_same(
         assert all(torch.equal(a, ends[1][key][name]) for name, a in ends[0][key].items())
     histories = []
     for r in (whole, result):
-        with tracking.start_run(store, run_id=r["run_id"], system_interval_s=0) as tracked:
+        with start_run(store, run_id=r["run_id"], system_interval_s=0) as tracked:
             histories.append(tracked.metric_history("train/loss/vote"))
     assert histories[0] == histories[1]  # one unbroken curve
 
@@ -355,7 +355,7 @@ def test_ctrl_c_during_training(words: list[str], tmp_path: Path, store: str, ve
     assert connect(resolve_store(store)).get_run(run_id).info.status == "KILLED"
 
 
-@pytest.mark.parametrize(("module", "moment"), [("training_data", "measure_clouds"), ("training_run", "assess")])
+@pytest.mark.parametrize(("module", "moment"), [("data", "measure_clouds"), ("run", "assess")])
 @CHEAP
 def test_ctrl_c_at_other_moments(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, moment: str
@@ -364,7 +364,7 @@ def test_ctrl_c_at_other_moments(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(importlib.import_module(module), moment, interrupt)
+        patch.setattr(importlib.import_module(f"attentionvote.workflows.train.{module}"), moment, interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(words)
     folder = job_folder(tmp_path)

@@ -8,21 +8,23 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import fleet_board
 import pytest
 import train
-from dataset_scenes import DatasetScenes
 from tiny_training import TINY_TRAINING
-from training_job import find_training
-from training_tracking import DATASET
 from written_piles import pile_records, write_piles
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.data import Clouds, CloudSettings
+from attentionvote.data.clouds import Clouds
+from attentionvote.data.sensing import CloudSettings
+from attentionvote.measurement.dataset_scenes import DatasetScenes
 from attentionvote.part import Part
-from attentionvote.simulation import Sensor, load_part
+from attentionvote.simulation.part_files import load_part
+from attentionvote.simulation.sensor import Sensor
 from attentionvote.training.checkpoint import load_trained
+from attentionvote.workflows.fleet import board as fleet_board
+from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.tracking import DATASET
 
 TINY = [
     "object=brick", *TINY_TRAINING, "workers=1", "force=false", "trainer.batch_size=2", "trainer.max_epochs=2",

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import train
-from training_job import find_training
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.training.checkpoint import load_trained
+from attentionvote.workflows.train.job import find_training
 
 # The set without its third part: the rod and the slider bearing pedestal.
 TWO = [

@@ -21,10 +21,10 @@ import start_processes
 import train
 from same_training import assert_same_training, runs
 from tiny_training import TINY_TRAINING
-from training_processes import Place, first_speaks, refuse_grid
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.workflows.train.processes import Place, first_speaks, refuse_grid
 
 ROOT = Path(__file__).resolve().parents[2]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
@@ -73,7 +73,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[str]], dic
     """Trains in this process, which has imported everything already; without figures, each of which takes a second."""
     import torch
 
-    from attentionvote.tracking import figures, scene_pictures
+    from attentionvote.drawing import figures, scene_pictures
 
     for module in (scene_pictures, figures):
         for name in ("scene_picture", "loss_figure", "precision_recall_figure", "ap_threshold_figure"):

@@ -10,7 +10,9 @@ import view
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.simulation import load_part, scene_set, scene_set_directory, scene_set_specs
+from attentionvote.simulation import scene_set
+from attentionvote.simulation.part_files import load_part
+from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]
 TINY += [f"simulation.camera.camera.{key}" for key in ("width=344", "height=257", "fx=567.0", "fy=567.0")]

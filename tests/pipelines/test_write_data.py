@@ -74,7 +74,7 @@ def test_ipa_data_of_a_generated_set_is_sound(root: Path, tmp_path: Path, still:
 
 
 def first_part_vertices() -> Any:
-    from attentionvote.simulation import load_part
+    from attentionvote.simulation.part_files import load_part
 
     return load_part("brick", "builtin:brick").vertices
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attentionvote.export import Limits, Parity
+from attentionvote.export.parity_record import Limits, Parity
 from attentionvote.registry.gates import Evidence, Gate, Origin, Rules, judge
 
 LIMITS = Limits(0.1, 0.01, 0.1, 0.01, 0.01, 0.001, 0, 0.002, scenes=32)

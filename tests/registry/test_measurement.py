@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from attentionvote.data.clouds import CloudSettings, sense
+from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.evaluation import evaluate
 from attentionvote.inference import PoseEstimator, load_bundle
-from attentionvote.registry.measurement import EvaluationSet, intervals, measure
-from attentionvote.simulation import PartCaster, Sensor
+from attentionvote.measurement.models import intervals, measure
+from attentionvote.measurement.scenes import EvaluationSet
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.sensor import Sensor
 
 SENSOR = Sensor("gaussian", sigma_mm=0.3)
 

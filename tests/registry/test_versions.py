@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from attentionvote import tracking
 from attentionvote.inference import load_bundle
 from attentionvote.registry.gates import Origin
 from attentionvote.tracking.provenance import git_state
+from attentionvote.tracking.run_opening import start_run
 
 
 def test_a_bundle_is_registered_once_and_comes_back_whole(versions, make_model, trusted_key, tmp_path):
@@ -81,11 +81,11 @@ def test_the_origin_is_what_the_training_left_in_the_store(versions, work_tree):
     assert versions.origin("", "key") == Origin(False, signed_by="key")
     assert versions.origin("feed" * 8, "key") == Origin(False, signed_by="key")
     settings = {"config_yaml": "a: 1\n", "repository": work_tree, "system_interval_s": 0}
-    with tracking.start_run(versions.uri, "bracket", **settings) as clean:
+    with start_run(versions.uri, "bracket", **settings) as clean:
         pass
     assert versions.origin(clean.id, "key") == Origin(True, True, (clean.commit,), True, "key")
     (work_tree / "a.txt").write_text("new\n")
-    with tracking.start_run(versions.uri, "bracket", run_id=clean.id, **settings) as dirty:
+    with start_run(versions.uri, "bracket", run_id=clean.id, **settings) as dirty:
         pass
     assert versions.origin(clean.id, "") == Origin(True, True, (clean.commit, dirty.commit), True)
     for spoiled in ("", "diff"):
@@ -96,13 +96,13 @@ def test_the_origin_is_what_the_training_left_in_the_store(versions, work_tree):
 def test_changes_that_were_cut_are_not_recorded(versions, work_tree, monkeypatch):
     monkeypatch.setattr(git_state, "__defaults__", (10,))
     (work_tree / "a.txt").write_text("new\n" * 10)
-    with tracking.start_run(versions.uri, "bracket", repository=work_tree, system_interval_s=0) as run:
+    with start_run(versions.uri, "bracket", repository=work_tree, system_interval_s=0) as run:
         pass
     assert versions.origin(run.id, "") == Origin(True, False, (run.commit,), False)
 
 
 def test_a_version_belongs_to_the_run_of_its_training(versions, make_bundle, trusted_key, tmp_path):
-    with tracking.start_run(versions.uri, "elsewhere", repository=tmp_path, system_interval_s=0) as run:
+    with start_run(versions.uri, "elsewhere", repository=tmp_path, system_interval_s=0) as run:
         pass
     bundle = load_bundle(make_bundle("of_a_run", card={"run_id": run.id}), trusted_key)
     assert versions.register(bundle, {}).run_id == run.id

@@ -73,7 +73,7 @@ def test_a_finite_symmetry_maps_the_vertices_exactly() -> None:
 
 
 def test_the_stand_in_of_the_brick_is_near_the_datasets_moments() -> None:
-    from attentionvote.simulation import load_part
+    from attentionvote.simulation.part_files import load_part
 
     expected = (0.00973728, 0.00512363, 0.00341862)
     np.testing.assert_allclose(np.diag(load_part("brick", "builtin:brick").covariance_root), expected, rtol=0.01)

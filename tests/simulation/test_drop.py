@@ -13,10 +13,11 @@ from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply
 from attentionvote.part import Part
-from attentionvote.simulation import drop, load_part
+from attentionvote.simulation import drop
 from attentionvote.simulation.decomposition import Hulls, convex_hulls
 from attentionvote.simulation.drop import BinSettings, DropSettings, Solid, drop_parts
 from attentionvote.simulation.mass import mass_properties
+from attentionvote.simulation.part_files import load_part
 
 BIN = np.array([0.15, 0.12, 0.1])
 

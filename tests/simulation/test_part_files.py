@@ -11,9 +11,9 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.simulation import BUILTIN_PARTS, load_part
-from attentionvote.simulation.cad import builtin_surface
+from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
 from attentionvote.simulation.mesh import write_surface
+from attentionvote.simulation.part_files import load_part
 
 FROM_DATASETS = {"bunny": 0.234355236, "tless_20": 0.107, "tless_22": 0.108, "tless_29": 0.135}
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry import native
 from attentionvote.geometry.pose import rotation_about, transform
-from attentionvote.simulation import Camera, PartCaster
+from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.ray_selection import FirstHits, Windows, random_order
-from attentionvote.simulation.raycast import BinSurface
+from attentionvote.simulation.raycast import BinSurface, PartCaster
 
 Heap = Callable[..., NDArray]
 

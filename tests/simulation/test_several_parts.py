@@ -14,14 +14,17 @@ from hypothesis import strategies as st
 
 from attentionvote.geometry.pose import apply, transform
 from attentionvote.part import Part, PartSet
-from attentionvote.simulation import PartCaster, SceneSet, Sensor, load_part, load_parts, scene_set, synthesize
+from attentionvote.simulation import scene_set
 from attentionvote.simulation.camera import Camera
+from attentionvote.simulation.cycle import draw_part_ids, solids_of
 from attentionvote.simulation.drop import BinSettings
-from attentionvote.simulation.raycast import BinSurface
+from attentionvote.simulation.part_files import load_part, load_parts
+from attentionvote.simulation.raycast import BinSurface, PartCaster
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records
-from attentionvote.simulation.scene_set import draw_part_ids, generate_scene_set, solids_of
+from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import SceneSetSpec
 from attentionvote.simulation.scene_view import scene_figure
+from attentionvote.simulation.sensor import Sensor, synthesize
 
 CAMERA = Camera(160, 120, 250.0, 250.0, 80.0, 60.0)
 

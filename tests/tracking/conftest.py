@@ -4,7 +4,7 @@ import contextlib
 
 import pytest
 
-from attentionvote import tracking
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, experiment_id
 
 EXPERIMENTS = ("rod", "grids")
@@ -26,7 +26,7 @@ def store(request, tmp_path_factory):
 
 @pytest.fixture
 def run(store):
-    run = tracking.start_run(store, "rod", name="test", system_interval_s=0)
+    run = start_run(store, "rod", name="test", system_interval_s=0)
     yield run
     run.close("FINISHED")
 

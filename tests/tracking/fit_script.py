@@ -11,7 +11,8 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
-from attentionvote import tracking
+from attentionvote.tracking.lightning_logger import RunLogger
+from attentionvote.tracking.run_opening import start_run
 
 
 class Tiny(LightningModule):
@@ -40,9 +41,7 @@ class Announce(Callback):
 
 def main(store: str, run_id: str, folder: Path, epochs: int) -> None:
     torch.manual_seed(0)
-    run = tracking.start_run(
-        store, "fit", name="tiny", run_id=None if run_id == "-" else run_id, params={"epochs": epochs}
-    )
+    run = start_run(store, "fit", name="tiny", run_id=None if run_id == "-" else run_id, params={"epochs": epochs})
     print(run.id, flush=True)
     training, validation = (torch.utils.data.DataLoader(torch.randn(count, 4), batch_size=3) for count in (60, 6))
     callbacks = [
@@ -51,7 +50,7 @@ def main(store: str, run_id: str, folder: Path, epochs: int) -> None:
         Announce(),
     ]
     trainer = Trainer(
-        accelerator="cpu", max_epochs=epochs, logger=tracking.RunLogger(run), callbacks=callbacks, log_every_n_steps=1,
+        accelerator="cpu", max_epochs=epochs, logger=RunLogger(run), callbacks=callbacks, log_every_n_steps=1,
         enable_progress_bar=False, enable_model_summary=False, default_root_dir=folder, num_sanity_val_steps=0,
     )  # fmt: skip
     last = folder / "last.ckpt"

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 import train
 
-from attentionvote import tracking
 from attentionvote.command.configuration import compose
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
 from attentionvote.tracking.store import connect, experiment_id
 
@@ -160,7 +160,7 @@ def test_people_share_experiments_and_no_password_is_logged(server, as_user, tmp
     ids = []
     for user in ("admin", "ann"):  # ann writes into what another has made
         as_user(user)
-        with tracking.start_run(server.url, "rod", params={"lr": 1}, config_yaml="lr: 1", system_interval_s=0) as run:
+        with start_run(server.url, "rod", params={"lr": 1}, config_yaml="lr: 1", system_interval_s=0) as run:
             run.log_metrics({"train/loss": 1.0}, 0)
             run.log_file("checkpoints/last.ckpt", tmp_path / "last.ckpt")
             assert run.flush(60)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from attentionvote.tracking import figures
-from attentionvote.tracking.scene_pictures import CORRECT, TRUTH, WRONG, Wireframe, scene_picture
+from attentionvote.drawing import figures
+from attentionvote.drawing.scene_pictures import CORRECT, TRUTH, WRONG, Wireframe, scene_picture
 
 BOX_VERTICES = np.array([[x, y, z] for x in (-0.07, 0.07) for y in (-0.02, 0.02) for z in (-0.01, 0.01)])
 BOX_FACES = np.array(

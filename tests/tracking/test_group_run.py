@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from attentionvote import tracking
 from attentionvote.tracking.group_run import GROUP_TAG, adopt, open_group
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect
 
 
@@ -31,7 +31,7 @@ def test_the_same_group_is_the_same_run_and_another_is_another(store, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_at_once_get_one_run(store):
-    tracking.start_run(store, "grids", system_interval_s=0).close()  # the tables are there
+    start_run(store, "grids", system_interval_s=0).close()  # the tables are there
     code = (
         "import sys; from attentionvote.tracking.group_run import open_group\n"
         "sys.stdin.readline(); run = open_group(sys.argv[1], 'grids', 'g', 'race'); print(run.id); run.close()"
@@ -51,7 +51,7 @@ def test_two_processes_at_once_get_one_run(store):
 @pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_a_child_is_adopted_once_and_a_lost_one_is_a_warning(store, caplog):
     client = connect(store)
-    child = tracking.start_run(store, "rod", system_interval_s=0)
+    child = start_run(store, "rod", system_interval_s=0)
     child.close()
     adopt(store, "first", child.id, {"sweep.state": "pruned"})
     adopt(store, "second", child.id, {"sweep.state": "complete"})

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from attentionvote import tracking
+from attentionvote.tracking.lightning_logger import RunLogger
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect
 
 SCRIPT = Path(__file__).with_name("fit_script.py")
@@ -28,7 +29,7 @@ def _checkpoint(folder, key, monitor, best, last="", score=None):
 
 @pytest.fixture
 def logger(run):
-    return tracking.RunLogger(run)
+    return RunLogger(run)
 
 
 def _stored(logger, folder):
@@ -81,8 +82,8 @@ def test_hyperparameters_may_come_twice_and_metrics_of_validation_are_stored_at_
 
 @pytest.mark.parametrize(("error", "status"), [(RuntimeError("x"), "FAILED"), (KeyboardInterrupt(), "KILLED")])
 def test_exception_in_training_ends_the_run(store, error, status):
-    run = tracking.start_run(store, "rod", system_interval_s=0)
-    logger = tracking.RunLogger(run)
+    run = start_run(store, "rod", system_interval_s=0)
+    logger = RunLogger(run)
     try:
         raise error
     except BaseException:
@@ -114,7 +115,7 @@ def test_training_killed_and_started_again_is_one_run_with_contiguous_metrics(st
     for name, count in {"train/loss": 9 * 20, "val/loss": 9, "val/ap_10": 9}.items():
         steps = [row.step for row in client.get_metric_history(run_id, name)]
         assert len(steps) == len(set(steps)) == count, (name, steps)
-    resumed = tracking.start_run(store, run_id=run_id, system_interval_s=0)
+    resumed = start_run(store, run_id=run_id, system_interval_s=0)
     stored = resumed.download("checkpoints", tmp_path / "out")
     resumed.close()
     assert {path.name for path in stored.iterdir()} == {

@@ -6,8 +6,8 @@ import subprocess
 
 import pytest
 
-from attentionvote import tracking
 from attentionvote.tracking.provenance import git_state, hardware, package_versions
+from attentionvote.tracking.run_opening import start_run
 
 
 def test_a_clean_tree_is_its_commit(work_tree):
@@ -88,10 +88,10 @@ def test_git_state_outside_of_a_repository_is_unknown(tmp_path):
 
 
 def test_every_session_of_a_run_names_its_commit_and_keeps_its_changes(store, work_tree, tmp_path):
-    with tracking.start_run(store, "rod", repository=work_tree, system_interval_s=0) as first:
+    with start_run(store, "rod", repository=work_tree, system_interval_s=0) as first:
         pass
     (work_tree / "a.txt").write_text("new\n")
-    with tracking.start_run(store, "rod", run_id=first.id, repository=work_tree, system_interval_s=0) as run:
+    with start_run(store, "rod", run_id=first.id, repository=work_tree, system_interval_s=0) as run:
         patch = run.download("resume_1/uncommitted.patch", tmp_path / "out").read_text()
     assert "+new" in patch
     state = git_state(work_tree)

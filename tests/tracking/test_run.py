@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from attentionvote import tracking
 from attentionvote.tracking.run import status_of
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect
 
 DIGEST = "0123456789abcdef" * 4
@@ -24,7 +24,7 @@ def client(store):
 
 @pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_start_run_records_what_it_was_given_and_where_it_comes_from(store, client, tmp_path):
-    run = tracking.start_run(
+    run = start_run(
         store, "rod", name="first", params={"lr": 0.001}, config_yaml="lr: 0.001\n", tags={"object": "rod"},
         datasets={"train": DIGEST}, system_interval_s=0,
     )  # fmt: skip
@@ -57,14 +57,12 @@ def test_logging_costs_less_than_a_millisecond_a_step(run):
 
 @pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_resume_keeps_parameters_repairs_status_and_continues_series(store, client, caplog, tmp_path):
-    run = tracking.start_run(store, "rod", params={"lr": 1}, config_yaml="a: 1", system_interval_s=0)
+    run = start_run(store, "rod", params={"lr": 1}, config_yaml="a: 1", system_interval_s=0)
     run.log_metrics({"train/loss": 5.0}, 1)
     run.log_metrics({"train/loss": 4.0}, 2)
     run.close("FAILED")
     assert client.get_run(run.id).info.status == "FAILED"
-    again = tracking.start_run(
-        store, "rod", run_id=run.id, params={"lr": 2, "new": 3}, config_yaml="a: 2", system_interval_s=0
-    )
+    again = start_run(store, "rod", run_id=run.id, params={"lr": 2, "new": 3}, config_yaml="a: 2", system_interval_s=0)
     assert client.get_run(run.id).info.status == "RUNNING"
     for step in (2, 3):  # step 2 is repeated, as after a checkpoint of step 1
         again.log_metrics({"train/loss": 9.0 - step, "test/ap_10": 0.1 * step}, step)
@@ -82,7 +80,7 @@ def test_resume_keeps_parameters_repairs_status_and_continues_series(store, clie
 
 def test_resume_of_an_unknown_run_is_one_sentence(store):
     with pytest.raises(ValueError, match=r"run_id must name a run in sqlite.*got 'nothing'"):
-        tracking.start_run(store, "rod", run_id="nothing")
+        start_run(store, "rod", run_id="nothing")
 
 
 @pytest.mark.parametrize(
@@ -100,7 +98,7 @@ def test_status_of(error, status):
 
 
 def test_leaving_the_block_by_an_exception_ends_the_run_as_failed(store, client):
-    with pytest.raises(RuntimeError), tracking.start_run(store, "rod", system_interval_s=0) as run:  # noqa: PT012
+    with pytest.raises(RuntimeError), start_run(store, "rod", system_interval_s=0) as run:  # noqa: PT012
         run.log_metrics({"x": 1.0}, 0)
         raise RuntimeError
     assert client.get_run(run.id).info.status == "FAILED"
@@ -111,7 +109,7 @@ def test_leaving_the_block_by_an_exception_ends_the_run_as_failed(store, client)
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, "KILLED"), (signal.SIGKILL, "RUNNING")])
 def test_killed_process_leaves_a_run_that_says_so_and_can_be_resumed(store, client, number, status):
     code = (
-        "import sys, time; from attentionvote.tracking import start_run\n"
+        "import sys, time; from attentionvote.tracking.run_opening import start_run\n"
         "run = start_run(sys.argv[1], 'rod', system_interval_s=0); run.log_metrics({'x': 1}, 0); run.flush()\n"
         "print(run.id, flush=True); time.sleep(60)"
     )
@@ -122,21 +120,21 @@ def test_killed_process_leaves_a_run_that_says_so_and_can_be_resumed(store, clie
         process.send_signal(number)
         process.wait(timeout=60)
     assert client.get_run(run_id).info.status == status
-    with tracking.start_run(store, "rod", run_id=run_id, system_interval_s=0) as run:
+    with start_run(store, "rod", run_id=run_id, system_interval_s=0) as run:
         run.log_metrics({"x": 2.0}, 1)
     assert client.get_run(run_id).info.status == "FINISHED"
     assert [row.value for row in client.get_metric_history(run_id, "x")] == [1.0, 2.0]
 
 
 def test_system_metrics_are_sampled_and_their_steps_go_on_after_a_resume(store, client):
-    run = tracking.start_run(store, "rod", system_interval_s=0.05)
+    run = start_run(store, "rod", system_interval_s=0.05)
     deadline = time.monotonic() + 20
     while len(run.metric_history("system/cpu_percent")[0]) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)
     run.close()
     first = client.get_metric_history(run.id, "system/process_memory_gib")
     assert all(0.01 < row.value < 100 for row in first)
-    again = tracking.start_run(store, "rod", run_id=run.id, system_interval_s=0.05)
+    again = start_run(store, "rod", run_id=run.id, system_interval_s=0.05)
     while len(again.metric_history("system/cpu_percent")[0]) <= len(first) and time.monotonic() < deadline:
         time.sleep(0.05)
     steps = again.metric_history("system/cpu_percent")[0]
@@ -156,16 +154,16 @@ def test_figure_names_with_a_step_stand_beside_each_other(run, tmp_path):
 
 @pytest.mark.parametrize("store", ["sqlite", "postgresql"], indirect=True)
 def test_a_run_below_another_one_keeps_its_parent(store, client):
-    above, other = (tracking.start_run(store, "grids", name=name, system_interval_s=0) for name in ("above", "other"))
-    below = tracking.start_run(store, "rod", system_interval_s=0, parent=above.id)
+    above, other = (start_run(store, "grids", name=name, system_interval_s=0) for name in ("above", "other"))
+    below = start_run(store, "rod", system_interval_s=0, parent=above.id)
     below.close()
-    tracking.start_run(store, "rod", run_id=below.id, system_interval_s=0, parent=other.id).close()
+    start_run(store, "rod", run_id=below.id, system_interval_s=0, parent=other.id).close()
     assert client.get_run(below.id).data.tags["mlflow.parentRunId"] == above.id
-    alone = tracking.start_run(store, "rod", system_interval_s=0)
+    alone = start_run(store, "rod", system_interval_s=0)
     alone.close()
-    tracking.start_run(store, "rod", run_id=alone.id, system_interval_s=0, parent=other.id).close()
+    start_run(store, "rod", run_id=alone.id, system_interval_s=0, parent=other.id).close()
     assert client.get_run(alone.id).data.tags["mlflow.parentRunId"] == other.id
     with pytest.raises(ValueError, match=r"parent must name a run in (sqlite|postgresql).*got 'nobody'"):
-        tracking.start_run(store, "rod", parent="nobody", system_interval_s=0)
+        start_run(store, "rod", parent="nobody", system_interval_s=0)
     for run in (above, other):
         run.close()

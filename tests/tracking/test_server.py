@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from attentionvote import tracking
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import serve
 from attentionvote.tracking.store import connect
 
@@ -24,7 +24,7 @@ def test_run_on_a_server_with_artefacts_an_outage_and_a_resume(put_tables, tmp_p
     checkpoint.write_bytes(b"weights" * 1000)
     with serve(store) as server:
         port = int(server.url.rsplit(":", 1)[1])
-        run = tracking.start_run(server.url, "rod", params={"lr": 1}, config_yaml="lr: 1", system_interval_s=0)
+        run = start_run(server.url, "rod", params={"lr": 1}, config_yaml="lr: 1", system_interval_s=0)
         run.log_metrics({"train/loss": 1.0}, 0)
         run.log_file("checkpoints/last.ckpt", checkpoint)
         assert run.flush(60)
@@ -42,7 +42,7 @@ def test_run_on_a_server_with_artefacts_an_outage_and_a_resume(put_tables, tmp_p
         assert run.metric_history("train/loss") == ([0, 1], [1.0, 2.0])
         assert run.download("checkpoints/last.ckpt", tmp_path / "new").read_bytes() == b"newer"
         run.close("FAILED")
-        with tracking.start_run(server.url, run_id=run.id, params={"lr": 1}, system_interval_s=0) as again:
+        with start_run(server.url, run_id=run.id, params={"lr": 1}, system_interval_s=0) as again:
             again.log_metrics({"train/loss": 3.0}, 2)
     stored = connect(store).get_run(run.id)
     assert stored.info.status == "FINISHED"

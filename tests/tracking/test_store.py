@@ -8,7 +8,7 @@ from collections import Counter
 
 import pytest
 
-from attentionvote import tracking
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
 from attentionvote.tracking.store import (
     artifact_root,
@@ -96,7 +96,7 @@ def test_what_goes_wrong_is_one_sentence_without_the_password(guarded, caplog, c
         assert len(str(caught.value).splitlines()) == 1
         said += traceback.format_exception(caught.value)  # what goes to outputs/logs
     with pytest.raises(ValueError, match=r"run_id must name a run in .*guarded:\*\*\*@") as unknown:
-        tracking.start_run(guarded, "rod", run_id="nothing")
+        start_run(guarded, "rod", run_id="nothing")
     said += [*traceback.format_exception(unknown.value), caplog.text, *capfd.readouterr()]
     assert not [text for text in said for secret in ("swordfish", "sword/fish", "sword%2F") if secret in text]
 
@@ -158,7 +158,7 @@ def test_exclusive_lets_one_in_at_a_time_and_the_next_after_a_kill(kind, request
 RACE = """
 import os, sys, tempfile, warnings
 warnings.simplefilter("ignore")
-from attentionvote.tracking import start_run
+from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import quiet_environment
 quiet_environment()
 import mlflow.store.tracking.sqlalchemy_store, mlflow.server.handlers

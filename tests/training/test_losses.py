@@ -15,7 +15,8 @@ from attentionvote.geometry.pose import canonical_quaternion, quaternion_from_ma
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.model import AttentionVote, Peaks, Poses, Votes, find_neighborhoods
 from attentionvote.part import Part
-from attentionvote.training.losses import Assignment, AttentionVoteLoss, LossSettings, batch_loss, masked_mean
+from attentionvote.training.losses import Assignment, AttentionVoteLoss, LossSettings, masked_mean
+from attentionvote.training.step import batch_loss
 
 WEIGHTS = dict.fromkeys(AttentionVoteLoss.TERMS, 1.0)
 PAPER = {"vote": 1.0, "center": 1.0, "rotation": 2.5, "semantic": 0.1, "confidence": 1.0}

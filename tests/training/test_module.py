@@ -20,8 +20,10 @@ from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_qu
 from attentionvote.model import AttentionVote
 from attentionvote.part import Part
 from attentionvote.scene import Scene
-from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
+from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.module import PoseTraining
 from attentionvote.training.pictures import ScenePictures, picture_inputs
+from attentionvote.training.schedule import Schedule
 
 ARGUMENTS: dict[str, Any] = {
     "diameter": 0.075,

@@ -16,9 +16,10 @@ from attentionvote.geometry.pose import quaternion_from_matrix
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.model import Peaks, Poses, Votes
 from attentionvote.part import Part, PartSet
-from attentionvote.training.losses import Assignment, AttentionVoteLoss, LossSettings, batch_loss
+from attentionvote.training.losses import Assignment, AttentionVoteLoss, LossSettings
 from attentionvote.training.part_poses import PartPoses
 from attentionvote.training.pose_loss import RotationLoss, SymmetricPose
+from attentionvote.training.step import batch_loss
 
 WEIGHTS = dict.fromkeys(AttentionVoteLoss.TERMS, 1.0)
 KINDS: tuple[RotationLoss, ...] = ("metric", "slerp", "minra", "nlerp")

@@ -15,9 +15,11 @@ from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.geometry.pose import transform
 from attentionvote.model import AttentionVote, Neighborhoods
 from attentionvote.part import Part
-from attentionvote.training import AttentionVoteLoss, LossSettings, PoseTraining, Schedule
-from attentionvote.training.losses import batch_loss
+from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.module import PoseTraining
 from attentionvote.training.processes import summed
+from attentionvote.training.schedule import Schedule
+from attentionvote.training.step import batch_loss
 from attentionvote.training.synced_norm import RowNormSync
 
 InProcesses = Callable[[int, Callable[..., Any]], list[Any]]

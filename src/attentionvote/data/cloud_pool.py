@@ -1,6 +1,6 @@
-"""Measures the clouds of scenes here, in several processes or on several machines.
+"""Clouds of scenes, measured here, in several processes or on several machines.
 
-Workers measure, this process writes the rows: they lie in files that are mapped into memory, and pages that two
+Workers measure, whoever asks writes the rows: they lie in files that are mapped into memory, and pages that two
 machines have mapped would overwrite each other's rows.
 """
 
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from numpy.typing import NDArray
-
-from attentionvote.data.clouds import CloudSettings, measure, measure_into, with_normals
 from attentionvote.data.dataset_split import DatasetSensing, DatasetSplit
+from attentionvote.data.sensing import CloudSettings, measure, with_normals
 from attentionvote.execution import Executor, WorkerDied, run_all
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
-from attentionvote.simulation import PartCaster, SceneRecord, SceneSet
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_record import SceneRecord
+from attentionvote.simulation.scene_set import SceneSet
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,15 @@ def jobs_of(
 def run_scenes(
     indices: Sequence[int],
     workers: int,
-    arrays: dict[str, NDArray],
     scenes: Sequence[Any],
     task: Callable[[Any], Scene],
     executor: Executor | None = None,
-) -> Iterator[None]:
-    """Measure these scenes into ``arrays``; yields once a scene.
+) -> Iterator[tuple[int, Scene]]:
+    """Measure these scenes; yields the index and the cloud of each as they come.
 
     Args:
         indices: of ``scenes``.
         workers: processes.
-        arrays: rows by index.
         scenes, task: see ``jobs_of``.
         executor: where the workers are; default this machine.
 
@@ -87,8 +85,7 @@ def run_scenes(
     try:
         with closing(run_all(task, jobs, executor, workers=max(1, workers))) as results:
             for job, scene in results:
-                measure_into(arrays, indices[job], scene)
-                yield None
+                yield indices[job], scene
     except WorkerDied as error:
         raise OSError(
             f"a worker process died while measuring clouds (out of memory? {error.how}) {error.times} times at scene "

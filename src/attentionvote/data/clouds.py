@@ -8,54 +8,25 @@ normals estimated on the whole (denser) cloud. A sample of an epoch is a random 
 from __future__ import annotations
 
 import fcntl
-import hashlib
-import json
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.data.cloud_pool import jobs_of, run_scenes
+from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution import Executor
-from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
-from attentionvote.simulation import PartCaster, SceneRecord, SceneSet, Sensor, synthesize
+from attentionvote.simulation.scene_set import SceneSet
 
 if TYPE_CHECKING:
     from attentionvote.data.dataset_split import DatasetSplit
 
-_VERSION = 1
 _SCENES_PER_PROCESS = 24
-
-
-@dataclass(frozen=True)
-class CloudSettings:
-    """What is measured of a scene.
-
-    Args:
-        sensor: the sensor and its noise.
-        density: most points of the cloud on which normals are estimated; the cell must use the same.
-        pool: points kept of it.
-        neighbors: of the normal estimation.
-    """
-
-    sensor: Sensor
-    density: int = 40_000
-    pool: int = 16_384
-    neighbors: int = 30
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.pool <= self.density:
-            raise ValueError(f"pool must lie in 1..{self.density} (density), got {self.pool}")
-
-    def key(self, scene_digest: str) -> str:
-        """Digest of everything that determines the stored clouds."""
-        content = json.dumps([_VERSION, scene_digest, asdict(self)], sort_keys=True, default=str)
-        return hashlib.sha256(content.encode()).hexdigest()
 
 
 class Truth(Protocol):
@@ -124,34 +95,6 @@ def _unit(stored: NDArray[np.int8]) -> NDArray[np.float32]:
     return np.stack([column / length for column in columns], axis=1)
 
 
-def sense(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> tuple[Scene, np.random.Generator]:
-    """One scene as the sensor delivers it, up to ``density`` points, and the scene's own random numbers after it."""
-    rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
-    return synthesize(record, caster, settings.sensor, settings.density, rng), rng
-
-
-def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> Scene:
-    """One scene as the network will see it: noisy points of the pool with normals from the whole cloud.
-
-    The random numbers come from the scene's own seed, so the cloud does not depend on who measures it and when.
-    """
-    return with_normals(*sense(record, caster, settings), settings)
-
-
-def with_normals(scene: Scene, rng: np.random.Generator, settings: CloudSettings) -> Scene:
-    """Points of the pool of a sensed scene, with normals from all of its points; empty where there are too few."""
-    if len(scene.points) < 3:
-        empty = np.zeros((0, 3), dtype=np.float32)
-        return Scene(
-            empty, np.zeros(0, np.int32), scene.camera_from_part, scene.visible_fraction, scene.part_ids, empty
-        )
-    kept = sample_indices(len(scene.points), min(settings.pool, len(scene.points)), rng)
-    points = scene.points.take(kept, axis=0)
-    normals = estimate_normals(scene.points, points, settings.neighbors)
-    ids = scene.instance_ids[kept]
-    return Scene(points, ids, scene.camera_from_part, scene.visible_fraction, scene.part_ids, normals)
-
-
 def measure_clouds(
     scenes: SceneSet | DatasetSplit,
     part: Parts,
@@ -188,21 +131,18 @@ def measure_clouds(
         done = open_arrays(directory, "r")["done"]
         missing = [int(i) for i in np.flatnonzero(done == 0)]
         if missing:
-            from attentionvote.data.cloud_pool import jobs_of, run_scenes
-
             # A process needs seconds to start, a scene a fraction of one.
             workers = min(workers, len(missing) // _SCENES_PER_PROCESS)
             arrays, (jobs, task) = open_arrays(directory, "r+"), jobs_of(scenes, part, settings)
-            results = run_scenes(missing, workers, arrays, jobs, task, executor)
+            measured: Iterable[tuple[int, Scene]] = run_scenes(missing, workers, jobs, task, executor)
             if progress:
                 from rich.console import Console
                 from rich.progress import track
 
-                console = Console(stderr=True)
-                for _ in track(results, f"{part.name}: measuring clouds", len(missing), console=console):
-                    pass
-            for _ in results:
-                pass
+                title = f"{part.name}: measuring clouds"
+                measured = track(measured, title, len(missing), console=Console(stderr=True))
+            for index, scene in measured:
+                measure_into(arrays, index, scene)
     return Clouds(directory, scenes)
 
 

@@ -21,7 +21,7 @@ from attentionvote.data.nearest_surface import PartSurface
 from attentionvote.datasets import Dataset, GroundTruth
 from attentionvote.part import Part
 from attentionvote.scene import BACKGROUND, Scene
-from attentionvote.simulation import Sensor
+from attentionvote.simulation.sensor import Sensor
 
 SHORT = 8  # digits of a cycle's digest that a model card keeps
 

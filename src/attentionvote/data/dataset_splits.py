@@ -17,7 +17,7 @@ from attentionvote.data.part_frame import check_part_frame
 from attentionvote.datasets import Dataset, open_datasets
 from attentionvote.datasets.recognition import split_of
 from attentionvote.part import Part
-from attentionvote.simulation import Sensor
+from attentionvote.simulation.sensor import Sensor
 
 log = logging.getLogger(__name__)
 SPLITS = ("train", "val", "test")

@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.data import Clouds, CloudSettings, collate, draw_sample, measure_clouds
-from attentionvote.data.clouds import sense
+from attentionvote.data.clouds import Clouds, measure_clouds
 from attentionvote.data.dataset_split import DatasetSensing, DatasetSplit
 from attentionvote.data.dataset_splits import DatasetSplits
-from attentionvote.data.samples import Batch
+from attentionvote.data.samples import Batch, collate, draw_sample
+from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.datasets import UnknownLayout
 from attentionvote.model import Layout
 from attentionvote.part import Parts
-from attentionvote.simulation import PartCaster, SceneSet, Sensor
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.simulation.sensor import Sensor
 
 
 def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:

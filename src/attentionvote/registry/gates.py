@@ -12,7 +12,7 @@ from typing import Any
 from attentionvote.contract import ModelCard
 from attentionvote.evaluation import interval
 from attentionvote.evaluation.scene_result import Array
-from attentionvote.export import Limits, Parity
+from attentionvote.export.parity_record import Limits, Parity
 
 PROVENANCE = ("commit", "data", "config", "versions", "signature")
 

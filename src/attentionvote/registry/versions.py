@@ -261,3 +261,6 @@ class Versions:
 def _version(row: ModelVersion) -> Version:
     tags = dict(row.tags)
     return Version(int(row.version), tags.get(DIGEST_TAG, ""), row.run_id or "", row.creation_timestamp / 1000, tags)
+
+
+DATA_FACT = "data."  # and the split: digest of the scenes that a version was trained with, among its tags

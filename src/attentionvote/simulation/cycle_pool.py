@@ -1,6 +1,6 @@
-"""Runs the drop cycles of a scene set, here, in several processes or on several machines, with a progress bar.
+"""Drop cycles of a scene set, simulated here, in several processes or on several machines, with a progress bar.
 
-Workers simulate, this process stores: a cycle is a few kilobytes, so no worker needs the set's directory, and nothing
+Workers simulate, whoever asks stores: a cycle is a few kilobytes, so no worker needs the set's directory, and nothing
 is written twice or by two.
 """
 
@@ -10,14 +10,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 from attentionvote.execution import Executor, WorkerDied, run_all
 from attentionvote.part import Parts
+from attentionvote.simulation.cycle import simulate_cycle
 from attentionvote.simulation.drop import Solid
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
-from attentionvote.simulation.scene_set import simulate_cycle, store_cycle
 from attentionvote.simulation.scene_spec import SceneSetSpec
 
 
@@ -45,25 +44,23 @@ def run_cycles(
     part: Parts,
     solids: Sequence[Solid],
     spec: SceneSetSpec,
-    directory: Path,
     cycles: Sequence[int],
     workers: int,
     progress: bool,
     title: str,
     done: int = 0,
     executor: Executor | None = None,
-) -> None:
-    """Simulate and store ``cycles``; ``done`` of the set were there before.
+) -> Iterator[tuple[int, list[SceneRecord]]]:
+    """Simulate ``cycles``, of which ``done`` were there before; yields each with its scenes as they come.
 
     Raises:
         OSError: when the worker of one cycle died again and again.
     """
     if not cycles:
         return
-    scene_counts = _stored(CycleTask(part, solids, spec), directory, cycles, workers, executor)
+    simulated = _simulated(CycleTask(part, solids, spec), cycles, workers, executor)
     if not progress:
-        for _ in scene_counts:
-            pass
+        yield from simulated
         return
     from rich.console import Console
     from rich.progress import (
@@ -87,20 +84,19 @@ def run_cycles(
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=120) as bar:
         task = bar.add_task(title, total=done + len(cycles), completed=done, scenes=0)
         scenes = 0
-        for count in scene_counts:
-            scenes += count
+        for cycle, records in simulated:
+            yield cycle, records
+            scenes += len(records)
             bar.update(task, advance=1, scenes=scenes)
 
 
-def _stored(
-    task: CycleTask, directory: Path, cycles: Sequence[int], workers: int, executor: Executor | None
-) -> Iterator[int]:
-    """Store every cycle as it comes; yields the number of its scenes."""
+def _simulated(
+    task: CycleTask, cycles: Sequence[int], workers: int, executor: Executor | None
+) -> Iterator[tuple[int, list[SceneRecord]]]:
     try:
         with closing(run_all(task, cycles, executor, workers=workers)) as results:
             for index, records in results:
-                store_cycle(directory, cycles[index], records)
-                yield len(records)
+                yield cycles[index], records
     except WorkerDied as error:
         raise OSError(
             f"a worker process died (out of memory? {error.how}) {error.times} times at cycle {cycles[error.job]} "

@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,15 +20,17 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from attentionvote.execution import Executor
 from attentionvote.part import Parts
-from attentionvote.simulation.decomposition import convex_hulls
-from attentionvote.simulation.drop import DropSettings, Solid, drop_parts
-from attentionvote.simulation.raycast import BinSurface, PartCaster
+from attentionvote.simulation.cycle import simulate_cycle, solids_of
+from attentionvote.simulation.cycle_pool import run_cycles
+from attentionvote.simulation.drop import Solid
+from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
+
+log = logging.getLogger("attentionvote.view")
 
 __all__ = [
     "SceneSet",
@@ -36,7 +39,6 @@ __all__ = [
     "generate_scene_set",
     "scene_set_directory",
     "scene_set_specs",
-    "simulate_cycle",
 ]
 
 
@@ -83,65 +85,6 @@ class SceneSet:
         return iter(self.records)
 
 
-def draw_part_ids(parts: int, count: int, rng: np.random.Generator) -> NDArray[np.int32]:
-    """``(count,)`` which of ``parts`` each drop is: every part once, in random order, then any, so that a pile of at
-    least as many drops as parts holds all of them ("objects including all categories", paper section 4.1)."""
-    return np.concatenate([rng.permutation(parts), rng.integers(parts, size=count)])[:count].astype(np.int32)
-
-
-def simulate_cycle(
-    part: Parts, solids: Sequence[Solid], caster: PartCaster, spec: SceneSetSpec, cycle: int
-) -> list[SceneRecord]:
-    """The scenes of one drop cycle; a pure function of its arguments.
-
-    Args:
-        part: what lies in the bin.
-        solids: of its parts, in their order.
-        caster: of the same.
-        spec: of the set.
-        cycle: which one.
-    """
-    most = spec.drop_counts[-1]
-    physics_seed, *scene_seeds, parts_seed = spec.cycle_seed(cycle).spawn(2 + len(spec.drop_counts))
-    part_ids = draw_part_ids(len(solids), most, np.random.default_rng(parts_seed))
-    rng = np.random.default_rng(physics_seed)
-    scale = spec.bin.scaling_diameter(part, most)
-    bin_size = spec.bin.sample(scale, rng)
-    friction = float(rng.uniform(*spec.drop.friction))
-    seeds = dict(zip(spec.drop_counts, scene_seeds, strict=True))
-    records = []
-    for pile in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng):
-        count = len(pile.bin_from_part)
-        if count not in seeds:
-            continue
-        scene_rng = np.random.default_rng(seeds[count])
-        camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
-        camera_from_part = camera_from_bin @ pile.bin_from_part
-        surface, own_ids = BinSurface(bin_size, camera_from_bin), part_ids[:count]
-        records.append(
-            SceneRecord(
-                cycle=cycle,
-                drop_count=count,
-                camera_from_part=camera_from_part,
-                visible_fraction=caster.visible_fraction(
-                    camera_from_part, spec.camera.camera, surface, spec.visibility_stride, own_ids
-                ),
-                camera=spec.camera.camera,
-                camera_from_bin=camera_from_bin,
-                bin_size=bin_size,
-                friction=friction,
-                scene_seed=int(scene_rng.integers(2**63)),
-                part_ids=own_ids,
-            )
-        )
-    return records
-
-
-def solids_of(part: Parts, settings: DropSettings) -> list[Solid]:
-    """The parts with their convex pieces."""
-    return [Solid(one, convex_hulls(one, settings.hull_threshold, settings.hull_vertices)) for one in part.parts]
-
-
 def generate_scene_set(
     part: Parts,
     spec: SceneSetSpec,
@@ -165,8 +108,6 @@ def generate_scene_set(
         OSError: when the worker of one cycle died again and again; what is finished is kept and the next call goes on
             from there.
     """
-    from attentionvote.simulation.cycle_pool import run_cycles
-
     if part.digest != spec.part_digest:
         raise ValueError(
             f"{part.name}: the scene set is specified for part {spec.part_digest[:12]}, this is {part.digest[:12]}"
@@ -191,7 +132,8 @@ def generate_scene_set(
             missing = [c for c in range(spec.cycles) if not _shard(directory, c).is_file()]
             title = f"{part.name}, {spec.split} scenes"
             done = spec.cycles - len(missing)
-            run_cycles(part, solids, spec, directory, missing, workers, progress, title, done, executor)
+            for cycle, records in run_cycles(part, solids, spec, missing, workers, progress, title, done, executor):
+                save_records(_shard(directory, cycle), records)
             _write_manifest(directory, part, spec, content_digest(directory, spec.cycles))
     return SceneSet.open(directory)
 
@@ -216,11 +158,6 @@ def content_digest(directory: Path, cycles: int) -> str:
             if r.part_ids.any():
                 h.update(r.part_ids.astype("<i4").tobytes())
     return h.hexdigest()
-
-
-def store_cycle(directory: Path, cycle: int, records: list[SceneRecord]) -> None:
-    """Store the scenes of one cycle."""
-    save_records(_shard(directory, cycle), records)
 
 
 def _shard(directory: Path, cycle: int) -> Path:
@@ -281,3 +218,21 @@ def _locked(directory: Path) -> Iterator[None]:
     with (directory / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+
+
+def find_record(part: Parts, caster: PartCaster, spec: SceneSetSpec, directory: Path, scene: int) -> SceneRecord:
+    """Scene number ``scene`` of a set, or of the cycle it would belong to, when the set is not complete."""
+    per_cycle = len(spec.drop_counts)
+    if scene >= spec.cycles * per_cycle:
+        raise ValueError(f"scene must be below {spec.cycles * per_cycle} in split {spec.split}; got {scene}")
+    if SceneSet.is_complete(directory):
+        records = SceneSet.open(directory).records
+        if scene >= len(records):
+            raise ValueError(f"scene must be below {len(records)}, the scenes in {directory}; got {scene}")
+        return records[scene]
+    cycle, entry = divmod(scene, per_cycle)
+    log.info("%s is not generated yet: simulating its cycle %d", directory, cycle)
+    cycle_records = simulate_cycle(part, solids_of(part, spec.drop), caster, spec, cycle)
+    if not cycle_records:
+        raise ValueError(f"scene must lie in a cycle with a settled pile, cycle {cycle} has none; got {scene}")
+    return cycle_records[min(entry, len(cycle_records) - 1)]

@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from attentionvote.data.samples import Batch
-from attentionvote.model import AttentionVote, Peaks, Poses, Votes
+from attentionvote.model import Peaks, Poses, Votes
 from attentionvote.part import Parts
 from attentionvote.training.part_poses import PartPoses
 from attentionvote.training.pose_loss import RotationLoss
-from attentionvote.training.processes import everyones, rank, summed
+from attentionvote.training.processes import summed
 
 QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
 
@@ -194,60 +194,6 @@ class AttentionVoteLoss:
     def _unit(self, part: Int[Tensor, "*rows"], lengths: Tensor) -> Float[Tensor, "*rows"] | float:
         """0.1 D of every row's part, metres, in the precision of the ``lengths`` that it divides."""
         return 0.1 * self.true_pose.diameter(part, lengths.dtype)
-
-
-def batch_loss(
-    model: AttentionVote, loss: AttentionVoteLoss, batch: Batch, ramp: float, least_heat: float
-) -> dict[str, Tensor]:
-    """All loss terms of one batch (Eq. 11), this process's part of them.
-
-    Args:
-        ramp: 0 during the warm-up, when only the votes are trained; the proposals are then not computed at all.
-        least_heat: proposals with less heat are left out of training; so are places beyond the last peak (heat 0).
-    """
-    votes = model.cast_votes(batch.points, batch.normals, batch.found)
-    terms = loss.vote_terms(votes, batch)
-    if ramp <= 0:
-        return terms
-    peaks = model.find_peaks(votes)
-    heat = peaks.heat.flatten()
-    rows = torch.nonzero((heat >= least_heat) & (heat > 0))[:, 0]
-    rows, chosen = _even_choice(rows, loss.settings.rows_per_scene * len(batch.points), len(heat))
-    if chosen < 2:  # batch statistics need two rows
-        return terms
-    poses = model.regress(votes, peaks, rows)
-    assigned = loss.assign(peaks, batch, rows)
-    terms |= loss.proposal_terms(poses, assigned, batch)
-    final = poses
-    steps = model.refine(batch.points, batch.normals, assigned.sample, poses)
-    if steps:
-        final = steps[-1]
-        terms["refined"] = torch.stack([loss.refined_term(step, assigned, batch) for step in steps]).mean()
-    if loss.settings.confidence == "quality":
-        terms |= loss.quality_term(final, assigned, batch)
-    return terms
-
-
-def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[Int[Tensor, " chosen"], int]:
-    """Every n-th row of the whole batch, so that ``most`` a process are left at most on average.
-
-    Args:
-        rows: this process's, in rising order, counted from its own first place.
-        most: rows a process.
-        places: rows that each process could have; the whole batch is the processes' places one after the other.
-
-    Returns:
-        this process's share of the choice, and the number of all chosen rows.
-    """
-    told = everyones(torch.stack([rows.new_tensor(len(rows)), rows.sum()])).tolist()
-    count = sum(size for size, _ in told)
-    stride = -(-count // (most * len(told)))
-    if stride <= 1:
-        return rows, count
-    # Which ones is as good as random, and the same in a continued training.
-    first = sum(total + size * places * process for process, (size, total) in enumerate(told)) % stride
-    before = sum(size for size, _ in told[: rank()])
-    return rows[(first - before) % stride :: stride], len(range(first, count, stride))
 
 
 def masked_mean(values: Float[Tensor, "*rows"], mask: Bool[Tensor, "*rows"]) -> Float[Tensor, ""]:

@@ -16,9 +16,10 @@ from attentionvote.part import Parts
 from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY
 from attentionvote.training.detections import scene_results
-from attentionvote.training.losses import AttentionVoteLoss, batch_loss
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.proposal_counts import ProposalCounts, proposal_counts
 from attentionvote.training.schedule import Schedule
+from attentionvote.training.step import batch_loss
 
 
 class PoseTraining(L.LightningModule):

@@ -1,0 +1,1 @@
+"""Models on frozen scenes: what workflows and registry measure alike."""

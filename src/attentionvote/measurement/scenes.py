@@ -1,0 +1,63 @@
+"""Scenes that models are measured on, and what a measurement needs of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from attentionvote.data.sensing import CloudSettings, sense
+from attentionvote.part import Parts
+from attentionvote.scene import Scene
+from attentionvote.simulation.raycast import PartCaster
+from attentionvote.simulation.scene_set import SceneSet
+
+
+class MeasuredScenes(Protocol):
+    """Scenes to measure on: ours, generated, or those of somebody else's dataset."""
+
+    @property
+    def part(self) -> Parts:
+        """The part in them."""
+
+    @property
+    def digest(self) -> str:
+        """Same digest, same clouds."""
+
+    @property
+    def title(self) -> str:
+        """What saw them, for people."""
+
+    def __len__(self) -> int: ...
+
+    def clouds(self) -> Iterator[Scene]:
+        """Every scene as the sensor delivered it, without background."""
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """Generated scenes, the part in them, the sensor that sees them, and the name of their split."""
+
+    scenes: SceneSet
+    part: Parts
+    settings: CloudSettings
+    split: str = "evaluation"
+
+    @property
+    def digest(self) -> str:
+        """Sha256 of everything that makes the clouds: same digest, same clouds."""
+        return self.settings.key(self.scenes.digest)
+
+    @property
+    def title(self) -> str:
+        """The sensor's preset."""
+        return self.settings.sensor.preset
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def clouds(self) -> Iterator[Scene]:
+        """Every scene as the sensor delivers it."""
+        caster = PartCaster(self.part)
+        for record in self.scenes.records:
+            yield sense(record, caster, self.settings)[0]

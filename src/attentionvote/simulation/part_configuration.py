@@ -1,0 +1,75 @@
+"""The configuration file of a new part, every figure with its meaning."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from attentionvote.part import Part
+    from attentionvote.simulation.symmetry_detection import SymmetryFinding
+
+
+def configuration_text(part: Part, finding: SymmetryFinding, mesh: Path, source: str) -> str:
+    """The object's configuration file, every figure with what it is and how it was found."""
+    from attentionvote.simulation.symmetry_detection import describe
+
+    d = part.diameter
+    root = "; ".join(" ".join(f"{v + 0.0:.7f}" for v in row) for row in part.covariance_root.round(7))
+    if finding.moved:
+        rows = "\n".join("#   " + " ".join(f"{v:12.9f}" for v in row) for row in finding.part_from_file + 0.0)
+        frame = (
+            "# Part frame: NOT the file's. Origin at the surface centroid, z along the symmetry axis, or the long\n"
+            f"# axis where there is none. part_from_file (metres) =\n{rows}\n"
+        )
+    else:
+        frame = "# Part frame: the file's own.\n"
+    if part.symmetry.kind == "none":
+        verified = "no rotation leaves the surface in place"
+    else:
+        verified = (
+            f"{describe(part.symmetry)}; every rotation checked leaves\n# the surface within "
+            f"{finding.residual * 1e3:.4f} mm ({finding.residual / d:.4%} of D) of itself"
+        )
+    rejected = "nothing else was near"
+    if (away := finding.runner_up_residual) < 1e9:
+        rejected = (
+            f"the best hypothesis rejected is\n# {finding.runner_up} (axis in the file's frame), "
+            f"which leaves it {away * 1e3:.3f} mm ({away / d:.2%} of D) away or more"
+        )
+    symmetry = "\n".join(f"  {key}: {json.dumps(value)}" for key, value in _symmetry_settings(part).items())
+    return f"""# {part.name}: made by `make part` from {source}.
+{frame}# Surface: {len(part.faces)} triangles, watertight. Lambda, the root of the surface covariance, metres, its rows:
+#   {root}
+_target_: attentionvote.simulation.load_part
+name: {part.name}
+title: {json.dumps(part.title, ensure_ascii=False)}
+mesh: {json.dumps(mesh.as_posix(), ensure_ascii=False)}
+units: m
+# Largest distance between two vertices, metres: the D of every threshold. Benchmarks may define it differently.
+diameter: {d!r}
+# Proper symmetry: {verified}
+# (tolerance {finding.tolerance * 1e3:.3f} mm, both ways); {rejected}.
+symmetry:
+{symmetry}
+# Scale settings in metres; null = derived from D by the documented rule.
+base_radius: null
+voxel_size: null
+"""
+
+
+def _symmetry_settings(part: Part) -> dict[str, Any]:
+    s = part.symmetry
+    settings: dict[str, Any] = {"kind": s.kind}
+    if s.kind in ("cyclic", "dihedral", "revolution"):
+        settings["axis"] = list(s.axis)
+    if s.kind in ("cyclic", "dihedral"):
+        settings["order"] = s.order
+    if s.kind == "dihedral":
+        settings["flip_axis"] = list(s.flip_axis)
+    if s.kind == "revolution":
+        settings["flip"] = s.flip
+    if s.kind == "group":
+        settings["quaternions"] = [list(q) for q in s.quaternions]
+    return settings

@@ -1,0 +1,1 @@
+"""The exported model on the frozen set of its part."""

@@ -1,0 +1,78 @@
+"""The frozen evaluation set of a part: its specification, its scenes, its recorded digest."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.execution.hardware import cores
+from attentionvote.part import Parts, only_part
+from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
+from attentionvote.simulation.sensor import Sensor
+
+if TYPE_CHECKING:
+    from attentionvote.measurement.scenes import EvaluationSet, MeasuredScenes
+
+log = logging.getLogger("attentionvote.evaluate")
+
+
+def set_spec(cfg: DictConfig, part: Parts, split: str | None = None, cycles: int | None = None) -> SceneSetSpec:
+    """What determines the frozen set; or cycles of another split of the same simulation.
+
+    Raises:
+        ValueError: when a setting is impossible.
+    """
+    settings: Any = OmegaConf.to_container(cfg.simulation, resolve=True)
+    split = split or cfg.evaluation.split
+    return scene_set_specs(part, settings | {"cycles": {split: cycles or cfg.evaluation.cycles}})[split]
+
+
+def scenes_of(cfg: DictConfig, part: Parts) -> MeasuredScenes:
+    """The scenes of a dataset when one is named, otherwise the frozen set, generated when it is not there yet.
+
+    Raises:
+        ValueError: when the dataset does not hold the part.
+    """
+    chosen = cfg.evaluation
+    if chosen.dataset is None:
+        return generated_set(cfg, part, set_spec(cfg, part))
+    from attentionvote.measurement.dataset_scenes import DatasetScenes
+
+    return DatasetScenes.find(Path(chosen.dataset), only_part(part, "a dataset's scenes"), chosen.density)
+
+
+def generated_set(cfg: DictConfig, part: Parts, spec: SceneSetSpec) -> EvaluationSet:
+    """Generated scenes and the sensor that sees them.
+
+    A frozen set whose digest is recorded in ``evaluation.frozen`` and is another one here is used, and said: physics
+    is a chain of floating-point operations, and a processor or library that rounds otherwise leads to other piles.
+    """
+    from attentionvote.data.sensing import CloudSettings
+    from attentionvote.measurement.scenes import EvaluationSet
+    from attentionvote.simulation.scene_set import generate_scene_set
+
+    directory = scene_set_directory(Path(cfg.root) / "scenes", part.name, spec)
+    scenes = generate_scene_set(part, spec, directory, cfg.workers or cores())
+    chosen = cfg.evaluation
+    settings = CloudSettings(Sensor(**chosen.sensor), density=chosen.density, pool=chosen.density)
+    made = EvaluationSet(scenes, part, settings, spec.split)
+    log.info("%s: %s set %s, %d scenes", part.name, spec.split, made.digest[:12], len(made))
+    if is_recorded(cfg, part, made) is False:
+        log.warning(
+            "%s: these scenes are %s, the frozen ones %s: figures of both are not of the same scenes",
+            part.name, scenes.digest[:12], chosen.frozen[part.name][:12],
+        )  # fmt: skip
+    return made
+
+
+def is_recorded(cfg: DictConfig, part: Parts, scenes: MeasuredScenes) -> bool | None:
+    """Whether scenes are those whose digest is recorded; None when none is, or they are of another kind."""
+    from attentionvote.measurement.scenes import EvaluationSet
+
+    recorded = cfg.evaluation.frozen.get(part.name)
+    if not recorded or not isinstance(scenes, EvaluationSet) or scenes.split != cfg.evaluation.split:
+        return None
+    return scenes.scenes.digest == recorded

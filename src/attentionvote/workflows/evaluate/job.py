@@ -1,0 +1,132 @@
+"""What ``evaluate`` and ``promote`` share: which bundle, the frozen evaluation set, and the measurement on it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from attentionvote.inference import Bundle, load_bundle
+from attentionvote.inference.bundles.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
+from attentionvote.part import Parts
+from attentionvote.simulation.sensor import Sensor
+from attentionvote.workflows.evaluate.frozen_set import scenes_of, set_spec
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+    from attentionvote.measurement.models import Measurement
+    from attentionvote.measurement.scenes import MeasuredScenes
+    from attentionvote.scene import Scene
+
+log = logging.getLogger("attentionvote.evaluate")
+
+
+@dataclass(frozen=True)
+class EvaluationJob:
+    """One bundle to be measured: its part, and the key that signed it."""
+
+    cfg: DictConfig
+    part: Parts
+    bundle: Bundle
+    key: Ed25519PublicKey
+
+    @classmethod
+    def find(cls, cfg: DictConfig) -> EvaluationJob:
+        """The bundle that a configuration names, verified, and the set it is measured on.
+
+        Raises:
+            ValueError: when there is no such bundle, it cannot be trusted, or a setting is impossible.
+        """
+        part: Parts = instantiate(cfg.object)
+        set_spec(cfg, part)
+        Sensor(**cfg.evaluation.sensor)
+        key = trusted_key(cfg.trusted_key)
+        bundle = load_bundle(_folder(Path(cfg.bundles) / part.name, cfg.bundle, part.name), key)
+        if bundle.card.part.digest != part.digest:
+            raise ValueError(
+                f"bundle {bundle.digest[:12]} must be of the part {part.name} as it is now ({part.digest[:12]}), got "
+                f"{bundle.card.part.digest[:12]}: its mesh, diameter or symmetry has changed, train and export it again"
+            )
+        return cls(cfg, part, bundle, key)
+
+    @property
+    def signer(self) -> str:
+        """Fingerprint of the key whose signature the bundle has."""
+        return fingerprint(self.key)
+
+    @property
+    def otherwise(self) -> str:
+        """What is asked of the model beside its card, for names of files."""
+        peak = self.cfg.evaluation.peak_threshold
+        return "" if peak is None else f"-peak{peak:g}"
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether the model is measured as cells run it, on the set that decides promotions."""
+        chosen = self.cfg.evaluation
+        return chosen.split == "evaluation" and chosen.dataset is None and not self.otherwise
+
+    def evaluation_set(self) -> MeasuredScenes:
+        """The scenes to measure on, see ``scenes_of``.
+
+        Raises:
+            ValueError: when the model was trained with them, or a dataset does not hold the part.
+        """
+        from attentionvote.measurement.scenes import EvaluationSet
+
+        scenes = scenes_of(self.cfg, self.part)
+        if not isinstance(scenes, EvaluationSet):
+            from attentionvote.measurement.dataset_scenes import DatasetScenes
+
+            assert isinstance(scenes, DatasetScenes)
+            scenes.check_unseen(self.bundle.card.data)
+        elif (made := scenes.scenes.digest) in self.bundle.card.data.values():
+            raise ValueError(
+                f"the evaluation set {made[:12]} must not be one that the model was trained with, but it is: change "
+                "simulation.seed"
+            )
+        return scenes
+
+    def measure(self, bundles: Sequence[Bundle], frozen: MeasuredScenes) -> list[Measurement]:
+        """Measure bundles side by side, with a progress bar."""
+        from rich.console import Console
+        from rich.progress import track
+
+        from attentionvote.measurement.models import measure
+
+        def shown(clouds: Iterator[Scene]) -> Iterable[Scene]:
+            what = "evaluating" if len(bundles) == 1 else "evaluating candidate and champion"
+            return track(clouds, f"{self.part.name}: {what}", len(frozen), console=Console(stderr=True))
+
+        chosen = self.cfg.evaluation
+        return measure(bundles, frozen, chosen.threads, shown, chosen.peak_threshold)
+
+
+def trusted_key(named: str | None) -> Ed25519PublicKey:
+    """The public key whose signature bundles must have.
+
+    Raises:
+        ValueError: when there is none.
+    """
+    return load_public_key(keys_folder() / PUBLIC_NAME if named is None else Path(named))
+
+
+def _folder(place: Path, name: str, part: str) -> Path:
+    """The bundle's folder below ``place``: ``latest``, or the only one whose name begins with ``name``."""
+    if name == "latest" and (place / name).exists():
+        return place / name
+    found = [p for p in sorted(place.glob("*")) if p.name.startswith(name) and p.is_dir() and not p.is_symlink()]
+    if len(found) == 1:
+        return found[0]
+    have = [
+        path.name for path in sorted(place.glob("*")) if (path / "manifest.json").is_file() and not path.is_symlink()
+    ]
+    if not have:
+        raise ValueError(f"{place} must hold a bundle, got none: run `make export OBJECT={part}`")
+    raise ValueError(f"bundle must name one bundle, {name!r} names {len(found)}; there are {', '.join(have)}")

@@ -1,0 +1,1 @@
+"""Result files of any method against the true poses."""

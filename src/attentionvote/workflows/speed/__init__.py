@@ -1,0 +1,1 @@
+"""Every fast path beside its references (`make bench`), and a server under load."""

@@ -1,0 +1,162 @@
+"""Which training a configuration means, where it lives, and whether it can work: known before torch is imported."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from attentionvote.command.executors import executor_of
+from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.files import locked_folder, read_json
+from attentionvote.part import Parts, only_part
+from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
+from attentionvote.simulation.sensor import Sensor
+from attentionvote.workflows.train.network import check_classes
+
+if TYPE_CHECKING:
+    from attentionvote.data.dataset_splits import DatasetSplits
+
+log = logging.getLogger("attentionvote.train")
+RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """One training.
+
+    Attributes:
+        directory: for its files.
+        part: what it looks for, or a set of parts.
+        specs: of the scene sets it needs, by split; empty with a dataset.
+        dataset: whose scenes it takes instead.
+    """
+
+    directory: Path
+    part: Parts
+    specs: dict[str, SceneSetSpec]
+    dataset: DatasetSplits | None = None
+
+    @property
+    def scene_counts(self) -> dict[str, int]:
+        """Number of scenes by split."""
+        if self.dataset is not None:
+            return {split: len(scenes) for split, scenes in self.dataset.splits.items()}
+        return {split: spec.cycles * len(spec.drop_counts) for split, spec in self.specs.items()}
+
+    @property
+    def run_id(self) -> str | None:
+        """Of the MLflow run, once there is one."""
+        run_id = (read_json(self.directory / RUN) or {}).get("run_id")
+        return run_id if isinstance(run_id, str) else None
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """What the training ended with; None while it is not complete or when its model is gone."""
+        result = read_json(self.directory / RESULT)
+        if result is not None and not (self.directory / MODEL).is_file():
+            log.warning("%s is gone: the training is completed again", self.directory / MODEL)
+            return None
+        return result
+
+    def forget(self) -> None:
+        """Remove everything this training has written so far; its MLflow run stays."""
+        for path in self.directory.iterdir():
+            if path.name != ".lock":
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Be the only process of this training; ConfigurationError when another one is at it."""
+        return locked_folder(self.directory, str(self.directory.parents[1]), "training")
+
+
+def find_training(cfg: DictConfig) -> TrainingJob:
+    """The training of a configuration: new, interrupted or complete; the configuration's parts are checked together.
+
+    Raises:
+        ValueError: with one sentence, when the parts of the configuration do not fit together.
+        OSError: when the part's mesh is missing.
+    """
+    part: Parts = instantiate(cfg.object)
+    simulation: Any = OmegaConf.to_container(cfg.simulation, resolve=True)
+    specs = scene_set_specs(part, simulation)
+    check_classes(cfg.model.classes, part)
+    for split in ("train", "val", "test"):
+        if split not in specs:
+            raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
+    job = TrainingJob(Path(cfg.outputs) / part.name, part, specs)
+    if cfg.data.dataset is not None:
+        job = replace(job, specs={}, dataset=_dataset(cfg, part))
+    _check(cfg, job.scene_counts["train"])
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)
+    for key in NOT_IDENTITY:
+        section, _, leaf = key.rpartition(".")
+        (plain[section] if section else plain).pop(leaf, None)
+    if len(part.parts) > 1:  # whether the number was also typed makes no other training
+        plain["model"]["classes"] = len(part.parts)
+    del plain["data"]["held_out"]  # what was trained without a dataset keeps its digest
+    if job.dataset is None:
+        del plain["data"]["dataset"]
+    else:  # the scenes are the identity, wherever they lie
+        del plain["simulation"]
+        plain["data"]["dataset"] = {split: scenes.digest for split, scenes in job.dataset.splits.items()}
+    digest = hashlib.sha256(json.dumps([plain, part.digest], sort_keys=True).encode()).hexdigest()
+    return replace(job, directory=job.directory / digest[:12])
+
+
+def _dataset(cfg: DictConfig, part: Parts) -> DatasetSplits:
+    from attentionvote.data.dataset_split import check_sensor
+    from attentionvote.data.dataset_splits import DatasetSplits
+
+    check_sensor(Sensor(**cfg.data.sensor))
+    only = only_part(part, "data.dataset")
+    return DatasetSplits.open(Path(cfg.data.dataset), only, {str(k): float(v) for k, v in cfg.data.held_out.items()})
+
+
+def _check(cfg: DictConfig, scenes: int) -> None:
+    from attentionvote.tracking.store import resolve_store
+
+    resolve_store(cfg.tracking.store)
+    executor_of(cfg)
+    Sensor(**cfg.data.sensor)
+    if cfg.trainer.batch_size > scenes:
+        raise ValueError(
+            f"trainer.batch_size must be at most the {scenes} training scenes, got {cfg.trainer.batch_size}"
+        )
+    steps = scenes // cfg.trainer.batch_size * cfg.trainer.max_epochs
+    if cfg.trainer.schedule.vote_steps >= steps:
+        raise ValueError(
+            f"trainer.schedule.vote_steps must be less than the {steps} steps of the training, or no pose is ever "
+            f"trained; got {cfg.trainer.schedule.vote_steps}"
+        )
+    if cfg.model.refinement is not None and cfg.model.refinement_steps:
+        if not cfg.loss.weights.get("refined", 0) > 0:
+            raise ValueError(
+                "loss.weights.refined must be greater than 0 with model.refinement, got 0: set one of them"
+            )
+        if cfg.model.confidence != "quality":
+            raise ValueError(
+                "model.confidence must be quality with model.refinement, whose scores Eq. 10 does not train; got "
+                f"{cfg.model.confidence}: set model.refinement=null"
+            )
+    most = max(cfg.trainer.peak_threshold, cfg.trainer.train_heat)
+    if cfg.model.proposal_source == "fps" and most > 1:
+        raise ValueError(
+            "trainer.peak_threshold and trainer.train_heat must be at most 1 with model.proposal_source=fps, whose "
+            f"proposals all have heat 1; got {most:g}"
+        )
+    if cfg.data.pool > cfg.data.density:
+        raise ValueError(f"data.pool must be at most data.density ({cfg.data.density}), got {cfg.data.pool}")
+    if cfg.data.points < cfg.model.centers[0]:
+        raise ValueError(
+            f"data.points must be at least model.centers[0] ({cfg.model.centers[0]}), got {cfg.data.points}"
+        )
