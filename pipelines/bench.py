@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import os
 
+from attentionvote.workflows.speed.settings import SpeedSettings
+
 # Before numpy is imported: its threads would count as processor time of one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -17,4 +19,4 @@ from attentionvote.command.entry import command
 from attentionvote.workflows.speed.job import run
 
 if __name__ == "__main__":
-    command("bench", run)
+    command(SpeedSettings, run)

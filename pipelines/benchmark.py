@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from attentionvote.command.entry import command
 from attentionvote.workflows.tables.job import run
+from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.train.preset import preset_of_hardware
 
 if __name__ == "__main__":
@@ -22,4 +23,4 @@ if __name__ == "__main__":
         said[:] = [*machine, *words]
         return machine
 
-    command("benchmark", lambda cfg: run(cfg, said), defaults=presets)
+    command(TablesSettings, lambda cfg: run(cfg, said), defaults=presets)

@@ -12,10 +12,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command
 from attentionvote.command.errors import ConfigurationError, Refused
+from attentionvote.workflows.settings import CheckDataSettings
 
 if TYPE_CHECKING:
     from attentionvote.datasets.check import Report
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.check_data")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: CheckDataSettings) -> dict[str, Any]:
     """Recognise, check, show; the same as data.
 
     Raises:
@@ -103,4 +102,4 @@ def show(reports: list[Report]) -> None:
 
 
 if __name__ == "__main__":
-    command("check_data", run)
+    command(CheckDataSettings, run)

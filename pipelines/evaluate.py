@@ -12,15 +12,14 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.files import read_json, write_json
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
 
 log = logging.getLogger("attentionvote.evaluate")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: EvaluateSettings) -> dict[str, Any]:
     """Measure, record, show; the figures."""
     from attentionvote.files import locked_folder
     from attentionvote.workflows.evaluate.frozen_set import is_recorded
@@ -49,4 +48,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("evaluate", run)
+    command(EvaluateSettings, run)

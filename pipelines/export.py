@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
+from attentionvote.workflows.settings import ExportSettings
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: ExportSettings) -> dict[str, Any]:
     """Export, prove, sign; where the bundle is and what the proof measured."""
     from attentionvote.workflows.export import ExportJob
 
@@ -32,4 +31,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("export", run)
+    command(ExportSettings, run)

@@ -14,6 +14,7 @@ import sys
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import command
 from attentionvote.workflows.fleet.job import run
+from attentionvote.workflows.fleet.settings import FleetSettings
 from attentionvote.workflows.train.preset import preset_of_workers
 
 if __name__ == "__main__":
@@ -21,7 +22,7 @@ if __name__ == "__main__":
 
     def presets(words: list[str]) -> list[str]:
         """The preset of the trainings, chosen and said once."""
-        preset[:] = preset_of_workers(compose("fleet", words), words)
+        preset[:] = preset_of_workers(compose(FleetSettings, words), words)
         return preset
 
-    command("fleet", lambda cfg: run(cfg, [*preset, *sys.argv[1:]]), defaults=presets)
+    command(FleetSettings, lambda cfg: run(cfg, [*preset, *sys.argv[1:]]), defaults=presets)

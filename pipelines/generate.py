@@ -14,29 +14,26 @@ import time
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.command.executors import executor_of
 from attentionvote.execution.hardware import cores
+from attentionvote.workflows.settings import GenerateSettings
 
 log = logging.getLogger("attentionvote.generate")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: GenerateSettings) -> dict[str, Any]:
     """Generate every asked-for split; digests and counts per split."""
-    from hydra.utils import instantiate
 
     from attentionvote.simulation.scene_set import generate_scene_set
     from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
 
     start = time.monotonic()
     with configuring(f"object {cfg.object.name}"):
-        part = instantiate(cfg.object)
+        part = cfg.object()
     with configuring():
-        simulation: Any = OmegaConf.to_container(cfg.simulation)
-        specs = scene_set_specs(part, simulation)
+        specs = scene_set_specs(part, cfg.simulation)
         executor = executor_of(cfg)
     unknown = [split for split in cfg.splits if split not in specs]
     if unknown or not cfg.splits:
@@ -59,4 +56,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("generate", run)
+    command(GenerateSettings, run)

@@ -9,14 +9,13 @@ import logging
 from time import localtime, strftime
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
+from attentionvote.workflows.settings import HistorySettings
 
 log = logging.getLogger("attentionvote.history")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: HistorySettings) -> dict[str, Any]:
     """Read the log, show it; the same as data."""
     from rich.console import Console
     from rich.table import Table
@@ -64,4 +63,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("history", run)
+    command(HistorySettings, run)

@@ -10,19 +10,18 @@ import re
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import whole, write_whole
 from attentionvote.simulation.part_configuration import _symmetry_settings, configuration_text
+from attentionvote.workflows.settings import PartSettings
 
 log = logging.getLogger("attentionvote.part")
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: PartSettings) -> dict[str, Any]:
     """Write mesh, picture and, last, the configuration; the figures and the paths."""
     name, config = _checked_name(cfg), Path(cfg.objects) / f"{cfg.name}.yaml"
     if not cfg.mesh:
@@ -74,7 +73,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     }
 
 
-def _checked_name(cfg: DictConfig) -> str:
+def _checked_name(cfg: PartSettings) -> str:
     name = str(cfg.name)
     if not name:
         raise ConfigurationError("name must be given, e.g. name=widget")
@@ -88,4 +87,4 @@ def _checked_name(cfg: DictConfig) -> str:
 
 
 if __name__ == "__main__":
-    command("part", run)
+    command(PartSettings, run)

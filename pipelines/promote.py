@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
+from attentionvote.workflows.settings import PromoteSettings
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: PromoteSettings) -> dict[str, Any]:
     """Measure, judge, register, move; the decision."""
     from attentionvote.workflows.promote import PromotionJob
 
@@ -25,4 +24,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("promote", run)
+    command(PromoteSettings, run)

@@ -12,15 +12,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import Refused
+from attentionvote.workflows.settings import RollbackSettings
 
 log = logging.getLogger("attentionvote.rollback")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: RollbackSettings) -> dict[str, Any]:
     """Choose, check, move; what is champion now."""
     from attentionvote.registry.history import History
     from attentionvote.registry.promotion import Superseded, move, stand, target
@@ -56,4 +55,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("rollback", run)
+    command(RollbackSettings, run)

@@ -9,23 +9,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.workflows.settings import ScoreSettings
 
 EXAMPLES = {"gt": "gt=test/gt", "results": "results=out/results"}
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: ScoreSettings) -> dict[str, Any]:
     """Recognise the format, score, show the table; the figures."""
     from attentionvote.workflows.score.report import show
 
     for name, example in EXAMPLES.items():
-        if not cfg[name]:
+        if not getattr(cfg, name):
             raise ConfigurationError(f"{name} must be given, e.g. {example}")
-        if not Path(cfg[name]).exists():
-            raise ConfigurationError(f"{name} must be a file or folder that is there, got {cfg[name]}")
+        if not Path(getattr(cfg, name)).exists():
+            raise ConfigurationError(f"{name} must be a file or folder that is there, got {getattr(cfg, name)}")
     with configuring():
         if _is_bop(cfg):
             from attentionvote.workflows.score.bop import scored
@@ -36,7 +35,7 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     return {"stage": "score", "gt": cfg.gt, "results": cfg.results, **result}
 
 
-def _is_bop(cfg: DictConfig) -> bool:
+def _is_bop(cfg: ScoreSettings) -> bool:
     """A CSV file is BOP's, a folder is Sileane's; what the format needs must be given."""
     results = Path(cfg.results)
     bop = results.is_file()
@@ -45,13 +44,13 @@ def _is_bop(cfg: DictConfig) -> bool:
             f"results must be a folder of NAME.json (Sileane) or a METHOD_DATASET-SPLIT.csv (BOP), got {results}"
         )
     kind, needed, other = ("a BOP CSV", "models", "poseutils") if bop else ("Sileane's files", "poseutils", "models")
-    if cfg[needed] is None:
+    if getattr(cfg, needed) is None:
         example = "models=ipd/models" if bop else "poseutils=bunny/poseutils.json"
         raise ConfigurationError(f"{needed} must be given to score {kind}, e.g. {example}")
-    if cfg[other] is not None:
-        raise ConfigurationError(f"{other} must not be given to score {kind}, got {cfg[other]}")
+    if getattr(cfg, other) is not None:
+        raise ConfigurationError(f"{other} must not be given to score {kind}, got {getattr(cfg, other)}")
     return bop
 
 
 if __name__ == "__main__":
-    command("score", run)
+    command(ScoreSettings, run)

@@ -12,18 +12,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from attentionvote.command.conf_folder import choices, primary_groups
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.words import words_beside, words_of
+from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.train.preset import preset_of_workers
 
 _PLACE = ("executor", "cluster")  # settings that say where trials run
 
 
-def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
+def run(cfg: SweepSettings, words: Sequence[str]) -> dict[str, Any]:
     """Bring the study to its total; its best trial.
 
     Args:
@@ -51,7 +50,7 @@ def training_words(words: Sequence[str]) -> list[str]:
 def preset_of_trials(words: Sequence[str]) -> list[str]:
     """The preset of the machines that train, told by the words that say which these are."""
     place = words_of(_PLACE, words)
-    return preset_of_workers(compose("sweep", [f"object={choices('object')[0]}", *place]), words)
+    return preset_of_workers(compose(SweepSettings, [f"object={choices('object')[0]}", *place]), words)
 
 
 def _space_name(words: Sequence[str]) -> str:
@@ -60,15 +59,11 @@ def _space_name(words: Sequence[str]) -> str:
     return said[-1] if said else str(primary_groups("sweep")["sweep"])
 
 
-def check(cfg: DictConfig) -> None:
+def check(cfg: SweepSettings) -> None:
     """What a grid of sweeps asks of each before the first starts."""
     from attentionvote.workflows.sweep.space import parse_space
 
-    parse_space(_plain(cfg.sweep.space), cfg)
-
-
-def _plain(node: Any) -> Any:
-    return OmegaConf.to_container(node, resolve=True)
+    parse_space(cfg.composed["sweep"]["space"], cfg)
 
 
 def main() -> None:
@@ -80,7 +75,7 @@ def main() -> None:
         said[:] = [*machine, *words]
         return machine
 
-    command("sweep", lambda cfg: run(cfg, said), defaults=defaults, check=check)
+    command(SweepSettings, lambda cfg: run(cfg, said), defaults=defaults, check=check)
 
 
 if __name__ == "__main__":

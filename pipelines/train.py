@@ -17,23 +17,22 @@ import os
 from contextlib import nullcontext
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.workflows.train.preset import preset_of_hardware
 from attentionvote.workflows.train.processes import Place, failing_at_once, first_speaks
+from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
 
 
-def run(cfg: DictConfig) -> dict[str, Any] | None:
+def run(cfg: TrainSettings) -> dict[str, Any] | None:
     """Make or read scenes, train, test; test figures and where the model is, None in all processes but the first."""
     place = Place.of(os.environ)
     with first_speaks(place):
         return _run(cfg, place)
 
 
-def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
+def _run(cfg: TrainSettings, place: Place) -> dict[str, Any] | None:
     from attentionvote.workflows.train.job import find_training
 
     with configuring(f"object {cfg.object.name}"):
@@ -60,7 +59,7 @@ def _run(cfg: DictConfig, place: Place) -> dict[str, Any] | None:
         return training.run()
 
 
-def check(cfg: DictConfig) -> None:
+def check(cfg: TrainSettings) -> None:
     """What a grid asks of every job before the first starts: the parts of its configuration fit together."""
     from attentionvote.workflows.train.job import find_training
 
@@ -69,4 +68,4 @@ def check(cfg: DictConfig) -> None:
 
 if __name__ == "__main__":
     with failing_at_once(os.environ):
-        command("train", run, defaults=preset_of_hardware, check=check)
+        command(TrainSettings, run, defaults=preset_of_hardware, check=check)

@@ -9,18 +9,16 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.workflows.settings import ViewSettings
 
 log = logging.getLogger("attentionvote.view")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: ViewSettings) -> dict[str, Any]:
     """Write the page and the pictures; their paths and what is in them."""
     import numpy as np
-    from hydra.utils import instantiate
 
     from attentionvote.simulation.raycast import PartCaster
     from attentionvote.simulation.scene_set import find_record
@@ -29,11 +27,10 @@ def run(cfg: DictConfig) -> dict[str, Any]:
     from attentionvote.simulation.sensor import Sensor, synthesize
 
     with configuring(f"object {cfg.object.name}"):
-        part = instantiate(cfg.object)
+        part = cfg.object()
     with configuring():
         sensor = Sensor(cfg.sensor, sigma_mm=cfg.sigma_mm)
-        simulation: Any = OmegaConf.to_container(cfg.simulation)
-        specs = scene_set_specs(part, simulation)
+        specs = scene_set_specs(part, cfg.simulation)
     if cfg.split not in specs:
         raise ConfigurationError(f"split must be one of {', '.join(specs)}; got {cfg.split!r}")
     spec, caster = specs[cfg.split], PartCaster(part)
@@ -54,4 +51,4 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command("view", run)
+    command(ViewSettings, run)

@@ -9,7 +9,8 @@ scenes is not written again; an interrupted writing leaves nothing but a folder 
 from __future__ import annotations
 
 from attentionvote.command.entry import command
+from attentionvote.workflows.settings import WriteDataSettings
 from attentionvote.workflows.write_data import run
 
 if __name__ == "__main__":
-    command("write_data", run)
+    command(WriteDataSettings, run)

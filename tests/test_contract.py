@@ -113,7 +113,7 @@ def test_the_tensors_follow_from_the_card() -> None:
 
 
 def test_the_outputs_are_the_networks() -> None:
-    from attentionvote.model import Predictions
+    from attentionvote.model.predictions import Predictions
 
     assert tuple(spec.name for spec in CARD.outputs) == Predictions._fields
 

@@ -9,7 +9,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from attentionvote.baselines import PpfDetector, PpfSettings, check_opencv
+from attentionvote.baselines.opencv import check_opencv
+from attentionvote.baselines.ppf import PpfDetector
+from attentionvote.baselines.settings import PpfSettings
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.part import Part

@@ -9,7 +9,7 @@ import pytest
 
 from attentionvote.data.clouds import Clouds, measure_clouds
 from attentionvote.data.sensing import CloudSettings
-from attentionvote.model import Layout
+from attentionvote.model.neighborhoods import Layout
 from attentionvote.part import Part
 from attentionvote.simulation.scene_set import SceneSet
 from attentionvote.simulation.sensor import Sensor

@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from attentionvote.data.augmentation import Augmentation
 from attentionvote.data.clouds import Clouds, measure_clouds
 from attentionvote.data.datamodule import EpochSampler, PartDataModule, scene_share
-from attentionvote.data.samples import Augmentation, Batch
+from attentionvote.data.samples import Batch
 from attentionvote.data.sensing import CloudSettings
-from attentionvote.model import Layout
+from attentionvote.model.neighborhoods import Layout
 from attentionvote.part import Part
 from attentionvote.simulation.scene_set import SceneSet
 

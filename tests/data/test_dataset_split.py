@@ -18,7 +18,7 @@ from attentionvote.data.nearest_surface import PartSurface
 from attentionvote.data.samples import draw_sample
 from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.datasets import Dataset, open_datasets
-from attentionvote.model import Layout
+from attentionvote.model.neighborhoods import Layout
 from attentionvote.part import Part
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord

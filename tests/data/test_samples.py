@@ -8,10 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from attentionvote.data.augmentation import Augmentation
 from attentionvote.data.clouds import Clouds
-from attentionvote.data.samples import Augmentation, Batch, collate, draw_sample
+from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.geometry.pose import apply
-from attentionvote.model import Layout, find_neighborhoods
+from attentionvote.model.neighborhoods import Layout, find_neighborhoods
 from attentionvote.scene import Scene
 
 

@@ -19,7 +19,7 @@ from attentionvote.execution import Executor, RayCluster
 from attentionvote.part import Part
 from attentionvote.simulation import cycle_pool, scene_set
 from attentionvote.simulation.camera import Camera, CameraSettings
-from attentionvote.simulation.drop import DropSettings
+from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import SceneSetSpec
 from attentionvote.simulation.sensor import Sensor

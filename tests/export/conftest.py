@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
 from attentionvote.export.checkpoint_card import model_card
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.simulation.part_files import load_part
 from attentionvote.training.checkpoint import save_trained

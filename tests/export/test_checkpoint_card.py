@@ -9,7 +9,7 @@ import pytest
 
 from attentionvote.contract import ModelCard
 from attentionvote.export.checkpoint_card import model_card, used_otherwise
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 
 VOLUME = ((0.4, 0.7), 0.2)

@@ -15,8 +15,7 @@ from attentionvote.contract import FOUND
 from attentionvote.export import graph_neighbors
 from attentionvote.export.graph_operators import OPSET, make_optional, write_out
 from attentionvote.export.onnx_file import quiet_exporter
-from attentionvote.model import Layout
-from attentionvote.model.neighborhoods import find_neighborhoods
+from attentionvote.model.neighborhoods import Layout, find_neighborhoods
 
 COUNT = 600
 LAYOUT = Layout((64, 32, 16, 8), (16, 8, 8, 4), (0.02, 0.04, 0.06, 0.12))

@@ -15,8 +15,10 @@ from attentionvote.contract import ModelCard
 from attentionvote.export.graph_network import ExportNetwork
 from attentionvote.inference.preparation import find_neighbors
 from attentionvote.inference.runtime import Session
-from attentionvote.model import AttentionVote, Layout, Predictions
 from attentionvote.model.layers import RowNorm
+from attentionvote.model.neighborhoods import Layout
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.predictions import Predictions
 
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32]]
 

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from attentionvote.data.sensing import sense
 from attentionvote.export import held_out
 from attentionvote.export.checkpoint_card import model_card
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.simulation import scene_set
 from attentionvote.simulation.raycast import PartCaster

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper
 import attentionvote
 from attentionvote.contract import CARD_KEY, LAYOUT_KEY, ModelCard, TensorSpec
 from attentionvote.export.onnx_file import OPSET, check_graph
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 
 
 @pytest.mark.slow

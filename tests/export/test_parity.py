@@ -16,7 +16,8 @@ from attentionvote.evaluation import SceneResult
 from attentionvote.export.parity import compare, measure_parity
 from attentionvote.export.parity_record import Limits, Parity, table
 from attentionvote.geometry.pose import rotation_about, transform
-from attentionvote.model import AttentionVote, find_neighborhoods
+from attentionvote.model.neighborhoods import find_neighborhoods
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 
 LIMITS = Limits(0.1, 0.01, 0.1, 0.01, 0.01, 0.001, 0, 0.002, scenes=2)

@@ -12,7 +12,7 @@ from attentionvote.evaluation import SceneResult
 from attentionvote.export.checkpoint_card import model_card
 from attentionvote.export.parity import compare
 from attentionvote.geometry.pose import rotation_about, transform
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part, PartSet
 
 

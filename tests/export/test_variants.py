@@ -20,13 +20,15 @@ from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.export.checkpoint_card import model_card
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.inference.runtime import Session
-from attentionvote.model import AttentionVote, Layout
 from attentionvote.model.fusion import FUSIONS
+from attentionvote.model.neighborhoods import Layout
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.scene import Scene
 from attentionvote.training.checkpoint import load_trained, save_trained
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.pose_loss import RotationLoss
+from attentionvote.training.settings import LossSettings
 from attentionvote.training.step import batch_loss
 
 POINTS = 96

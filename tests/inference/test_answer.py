@@ -71,7 +71,7 @@ def test_what_is_detected_is_what_training_measured(
     import torch
 
     from attentionvote.data.samples import Batch
-    from attentionvote.model import Predictions
+    from attentionvote.model.predictions import Predictions
 
     card = make_card(peak_threshold=peak, confidence_threshold=least)
     raw = outputs([heat for heat, _ in pairs], [confidence for _, confidence in pairs], seed)

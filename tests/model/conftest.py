@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from attentionvote.geometry import native
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 
 SMALL: dict[str, Any] = {
     "diameter": 0.1,

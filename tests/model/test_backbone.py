@@ -9,9 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from attentionvote.model import find_neighborhoods
 from attentionvote.model.backbone import Backbone, FeaturePropagation, SetAbstraction
-from attentionvote.model.neighborhoods import Layout, Neighborhoods
+from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_neighborhoods
 from attentionvote.model.point_features import pair_features_reference
 
 pytestmark = pytest.mark.usefixtures("kernels")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from attentionvote.geometry.sampling import farthest_point_order
-from attentionvote.model import Peaks
 from attentionvote.model.farthest_votes import FarthestVotes, farthest_vote_peaks
+from attentionvote.model.proposals import Peaks
 
 
 def proposals(votes: Tensor, count: int) -> Peaks:

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from attentionvote.geometry import sampling_reference
-from attentionvote.model import Layout, Neighborhoods, find_neighborhoods
-from attentionvote.model.neighborhoods import find_batch
+from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch, find_neighborhoods
 
 LAYOUT = Layout((40, 20, 10, 5), (6, 5, 4, 3), (0.02, 0.04, 0.06, 0.12))
 

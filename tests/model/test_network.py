@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from attentionvote.model import AttentionVote, Peaks, find_neighborhoods
-from attentionvote.model.proposals import gather_votes
+from attentionvote.model.neighborhoods import find_neighborhoods
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.proposals import Peaks, gather_votes
 
 pytestmark = pytest.mark.usefixtures("kernels")
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from attentionvote.workflows.settings import GenerateSettings
+
 
 @pytest.fixture(scope="session")
 def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -33,7 +35,7 @@ def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "hulls").exists():
             (folder / "new").mkdir()
-            drop = compose("generate", ["object=brick"]).simulation.drop
+            drop = compose(GenerateSettings, ["object=brick"]).simulation.drop
             for name in BUILTIN_PARTS:
                 part = load_part(name, f"builtin:{name}")
                 piece = part.vertices[ConvexHull(part.vertices).vertices]

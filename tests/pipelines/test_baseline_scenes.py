@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attentionvote.baselines import PpfSettings
+from attentionvote.baselines.settings import PpfSettings
 from attentionvote.data.sensing import CloudSettings, measure
 from attentionvote.measurement.baseline_scenes import ppf_results
 from attentionvote.part import Part

@@ -15,6 +15,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import Refused
 from attentionvote.geometry import sampling_reference
 from attentionvote.workflows.speed import rows as bench_rows
+from attentionvote.workflows.speed.settings import SpeedSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["object=brick", "compact=['experiment=smoke']", "full=['experiment=smoke']", "rounds=2"]
@@ -84,7 +85,7 @@ def test_unequal_results_are_an_error_and_no_figure(tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(sampling_reference, "ball_query", wrong)
     page = tmp_path / "page.md"
-    cfg = compose("bench", [*SMALL, "rows='ball-query,gpu-champion'", f"page={page}"])
+    cfg = compose(SpeedSettings, [*SMALL, "rows='ball-query,gpu-champion'", f"page={page}"])
     with pytest.raises(
         Refused, match=r"1 rows failed \(first: ball-query: results must be identical to those of numpy"
     ):

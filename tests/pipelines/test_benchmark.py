@@ -16,8 +16,12 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import write_json
 from attentionvote.inference import load_bundle
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
 from attentionvote.workflows.export import ExportJob
+from attentionvote.workflows.settings import ExportSettings
+from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 # One cycle of two scenes with a few bricks.
@@ -38,7 +42,9 @@ def run(tmp_path: Path, *words: str, **environment: str) -> subprocess.Completed
 def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any, tmp_path: Path) -> None:
     """The brick is trained and exported; two rows want another training, which nobody has made."""
     bundle = export_brick("model", "feed" * 8)
-    trained = find_training(compose("train", ["object=brick", "experiment=smoke", "outputs=outputs/train"])).directory
+    trained = find_training(
+        compose(TrainSettings, ["object=brick", "experiment=smoke", "outputs=outputs/train"])
+    ).directory
     trained.mkdir(parents=True)
     (trained / "model.ckpt").write_bytes(b"weights")
     facts = {"run_id": "feed" * 8, "steps": 8, "train_seconds": 60.0, "commit": "c" * 40}
@@ -47,7 +53,7 @@ def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any
     (tmp_path / "outputs" / "export").rename(tmp_path / "outputs" / "benchmark" / "export")
     exported = ["object=brick", "scenes=32", "outputs=outputs/benchmark/export"]
     bundle = load_bundle((tmp_path / "outputs" / "benchmark" / "export" / "brick" / "latest").resolve(), None)
-    ExportJob.find(compose("export", exported)).finish(bundle, {})
+    ExportJob.find(compose(ExportSettings, exported)).finish(bundle, {})
     smoke = ["experiment=smoke", "force=false", "export=['scenes=32']"]
     done = run(tmp_path, "table=table_5", "objects=brick", *smoke, "rows='ours,VoteNet-style,PPF'", *COARSE)
     assert done.returncode == 0, done.stderr
@@ -130,10 +136,10 @@ def test_the_frozen_scenes_are_recorded_by_digest(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(benchmark, "RECORDED", recorded)
     few = ["evaluation.cycles=1", "simulation=smoke", "simulation.drop_counts=[1]", "workers=1"]
     told = ",".join(repr(word) for word in few)
-    cfg = compose("benchmark", ["table=table_5", f"root={tmp_path}", f"evaluate=[{told}]"])
+    cfg = compose(TablesSettings, ["table=table_5", f"root={tmp_path}", f"evaluate=[{told}]"])
     monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
     answer = benchmark.record(cfg, ["bunny", "brick"])  # the first has no mesh here
-    own = compose("evaluate", ["object=brick", "evaluation=benchmark", f"root={tmp_path}", *few])
+    own = compose(EvaluateSettings, ["object=brick", "evaluation=benchmark", f"root={tmp_path}", *few])
     part = instantiate(own.object)
     frozen = generated_set(own, part, set_spec(own, part))
     assert answer["frozen"] == {"brick": frozen.scenes.digest} | ({"zebra": "abc"} if known else {})

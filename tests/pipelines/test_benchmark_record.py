@@ -13,6 +13,7 @@ from attentionvote.workflows.page_sections import put
 from attentionvote.workflows.tables.cells import CellFailed, cells_of_parts
 from attentionvote.workflows.tables.page import markdown
 from attentionvote.workflows.tables.record import BenchmarkRecord
+from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.tables.table import BenchmarkTable
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -69,7 +70,7 @@ def test_a_bin_of_several_parts_is_a_cell_a_part() -> None:
 @pytest.mark.parametrize("place", sorted((DOCS / "benchmarks").glob("*_*.json")), ids=lambda place: place.stem)
 def test_the_projects_page_shows_what_its_files_keep(place: Path, tmp_path: Path) -> None:
     """Nobody has changed a number on the page, or the table, by hand."""
-    cfg = compose("benchmark", [f"table={place.stem}"])
+    cfg = compose(TablesSettings, [f"table={place.stem}"])
     table = BenchmarkTable.of(place.stem, OmegaConf.to_container(cfg.table, resolve=True))  # type: ignore[arg-type]
     cells = BenchmarkRecord.beside(str(DOCS / "benchmarks.md"), table.name).cells
     assert {row for row, _ in cells} <= {row.name for row in table.measured}

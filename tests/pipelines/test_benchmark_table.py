@@ -10,7 +10,10 @@ from omegaconf import OmegaConf
 
 from attentionvote.command.conf_folder import CONF, choices
 from attentionvote.command.configuration import compose
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
+from attentionvote.workflows.settings import ExportSettings
 from attentionvote.workflows.tables.table import BenchmarkTable, mean, title_of
+from attentionvote.workflows.train.settings import TrainSettings
 
 NAMES = sorted(path.stem for path in (CONF / "table").glob("*.yaml"))
 
@@ -39,11 +42,11 @@ def test_every_row_composes_with_the_verbs_it_means(name: str) -> None:
     table = BenchmarkTable.of(name, content(name))
     assert set(table.objects) <= set(choices("object"))
     for row in table.measured:
-        train = compose("train", [f"object={row.together or 'brick'}", *row.train])
+        train = compose(TrainSettings, [f"object={row.together or 'brick'}", *row.train])
         assert set(table.objects) <= set(train.object.get("parts", table.objects))
         assert OmegaConf.to_container(train, resolve=True)
-        compose("export", ["object=brick", *row.export])
-        compose("evaluate", ["object=brick", "evaluation=benchmark", *row.evaluate])
+        compose(ExportSettings, ["object=brick", *row.export])
+        compose(EvaluateSettings, ["object=brick", "evaluation=benchmark", *row.evaluate])
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,48 @@ from __future__ import annotations
 
 import shutil
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 import pytest
 
-from attentionvote.command.configuration import compose, leaves, type_problem
+from attentionvote.command.configuration import VerbSettings, compose, leaves, type_problem
 from attentionvote.command.errors import ConfigurationError, nearest, sentence
+from attentionvote.setting import Setting, Target
+from attentionvote.workflows.train.settings import TrainSettings
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """The group ``trainer``."""
+
+    lr: Annotated[float, Setting("Rate.", above=0, high=10)]
+    max_epochs: Annotated[int, Setting("Epochs.", low=1, high=100)]
+    dir: Annotated[str, Setting("Folder.")]
+
+
+def load(name: str, diameter: Annotated[float, Setting("D in metres.", above=0, high=10)]) -> tuple[str, float]:
+    """What an object describes."""
+    return name, diameter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fake(VerbSettings):
+    """Settings of a verb."""
+
+    verb: ClassVar[str] = "fake"
+    object: Target
+    trainer: Trainer
+    seed: Annotated[int, Setting("Seed.", low=0, high=2**32 - 1)]
+    batch_size: Annotated[int, Setting("Scenes.", low=1, high=1000)]
+    workers: Annotated[int | None, Setting("Processes.", low=1, high=1024)]
+    flag: Annotated[bool, Setting("Whether.")]
+    lengths: Annotated[tuple[float, ...], Setting("Lengths.", low=0, high=10)]
+    title: Annotated[str, Setting("Title.")]
+    out: Annotated[str, Setting("Folder.")]
+    must: Annotated[str, Setting("Given.")]
+
 
 FILES = {
     "fake.yaml": """
@@ -24,8 +60,8 @@ title: a text
 out: ${trainer.dir}/x
 must: given
 """,
-    "object/connecting_rod.yaml": "{name: connecting_rod, diameter: 0.143}",
-    "object/gear.yaml": "{name: gear, diameter: 0.121}",
+    "object/connecting_rod.yaml": f"{{_target_: {__name__}.load, name: connecting_rod, diameter: 0.143}}",
+    "object/gear.yaml": f"{{_target_: {__name__}.load, name: gear, diameter: 0.121}}",
     "trainer/default.yaml": "{lr: 0.001, max_epochs: 3, dir: outputs}",
     "trainer/broken.yaml": "{lr: [0.001",
     "experiment/short.yaml": "# @package _global_\ntrainer: {max_epochs: 1}\n",
@@ -45,13 +81,13 @@ def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_compose_takes_overrides_and_resolves_everything(conf: Path) -> None:
-    cfg = compose("fake", ["object=gear", "trainer.lr=0.1", "trainer.dir=a b", "workers=3"], conf)
+    cfg = compose(Fake, ["object=gear", "trainer.lr=0.1", "trainer.dir=a b", "workers=3"], conf)
     assert (cfg.object.name, cfg.trainer.lr, cfg.out, cfg.workers) == ("gear", 0.1, "a b/x", 3)
 
 
 def test_an_experiment_is_stronger_than_the_primary_file_and_weaker_than_the_words(conf: Path) -> None:
-    assert compose("fake", ["object=gear", "experiment=short"], conf).trainer.max_epochs == 1
-    assert compose("fake", ["object=gear", "experiment=short", "trainer.max_epochs=9"], conf).trainer.max_epochs == 9
+    assert compose(Fake, ["object=gear", "experiment=short"], conf).trainer.max_epochs == 1
+    assert compose(Fake, ["object=gear", "experiment=short", "trainer.max_epochs=9"], conf).trainer.max_epochs == 9
 
 
 @pytest.mark.parametrize(
@@ -76,7 +112,7 @@ def test_an_experiment_is_stronger_than_the_primary_file_and_weaker_than_the_wor
         ("object=gear trainer.lr=[1]", "trainer.lr must be a finite number such as 0.001; got [1]"),
         ("object=gear trainer.lr=-1", "trainer.lr must be greater than 0 and at most 10; got -1"),
         ("object=gear batch_size=2.5", "batch_size must be a whole number such as 4; got 2.5"),
-        ("object=gear batch_size=-2", "batch_size must be at least 1; got -2"),
+        ("object=gear batch_size=-2", "batch_size must be at least 1 and at most 1000; got -2"),
         ("object=gear workers=0", "workers must be a whole number at least 1 and at most 1024; got 0"),
         ("object=gear flag=3", "flag must be true or false, such as True; got 3"),
         ("object=gear lengths=[1,a]", "lengths[1] must be a finite number such as 2.0; got 'a'"),
@@ -87,13 +123,13 @@ def test_an_experiment_is_stronger_than_the_primary_file_and_weaker_than_the_wor
         ("object=gear trainer.dir=${nowhere}", "out cannot be resolved: Interpolation key 'nowhere' not found"),
         ("object=gear foo", "every argument must be key=value, got 'foo'"),
         ("object=gear seed={", "every argument must be key=value, got 'seed={'"),
-        ("object=gear experiment=negative", "batch_size must be at least 1; got -4"),
+        ("object=gear experiment=negative", "batch_size must be at least 1 and at most 1000; got -4"),
         ("object=gear experiment=misspelt", "trainer must be one of broken, default; got 'defualt', did you mean 'default'?"),
     ],
 )  # fmt: skip
 def test_what_is_impossible_gets_one_sentence(conf: Path, words: str, expected: str) -> None:
     with pytest.raises(ConfigurationError) as raised:
-        compose("fake", words.split(), conf)
+        compose(Fake, words.split(), conf)
     assert sentence(raised.value) == expected
 
 
@@ -101,22 +137,22 @@ def test_a_file_that_changes_between_two_calls_counts(conf: Path, tmp_path: Path
     own = tmp_path / "conf"
     shutil.copytree(conf, own)
     words = ["object=gear", "trainer.lr=0.1"]
-    assert compose("fake", words, own).trainer.lr == 0.1
+    assert compose(Fake, words, own).trainer.lr == 0.1
     trainer = own / "trainer" / "default.yaml"
     trainer.write_text(trainer.read_text(encoding="utf-8").replace("lr:", "rate:"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"there is no setting 'trainer\.lr'"):
-        compose("fake", words, own)
+        compose(Fake, words, own)
 
 
 def test_a_broken_file_is_named(conf: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"broken\.yaml"):
-        compose("fake", ["object=gear", "trainer=broken"], conf)
+        compose(Fake, ["object=gear", "trainer=broken"], conf)
 
 
-@pytest.mark.parametrize(("words", "value"), [("+new=1", 1), ("++seed=3", 3)])
-def test_plus_adds_what_is_not_there(conf: Path, words: str, value: int) -> None:
-    cfg = compose("fake", ["object=gear", words], conf)
-    assert cfg[words.strip("+").partition("=")[0]] == value
+def test_plus_plus_sets_what_is_there_and_plus_adds_no_unknown_setting(conf: Path) -> None:
+    assert compose(Fake, ["object=gear", "++seed=3"], conf).seed == 3
+    with pytest.raises(ConfigurationError, match=r"^there is no setting 'sed', did you mean 'seed'\?$"):
+        compose(Fake, ["object=gear", "+sed=1"], conf)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +192,7 @@ def test_the_ablations_of_the_benchmarks_are_trainings(words: list[str]) -> None
     from attentionvote.workflows.train.job import find_training
 
     plain = ["object=connecting_rod", "experiment=compact"]
-    job, base = (find_training(compose("train", [*plain, *more])) for more in (words, []))
+    job, base = (find_training(compose(TrainSettings, [*plain, *more])) for more in (words, []))
     assert (job.directory == base.directory) == (not words)
 
 
@@ -175,7 +211,7 @@ def test_there_are_ablations_in_the_benchmarks() -> None:
 def test_thresholds_that_no_farthest_vote_passes_are_refused(words: list[str], message: str) -> None:
     from attentionvote.workflows.train.job import find_training
 
-    cfg = compose("train", ["object=connecting_rod", "experiment=votenet", *words])
+    cfg = compose(TrainSettings, ["object=connecting_rod", "experiment=votenet", *words])
     with pytest.raises(ValueError, match=message) if message else nullcontext():
         find_training(cfg)
 
@@ -183,4 +219,4 @@ def test_thresholds_that_no_farthest_vote_passes_are_refused(words: list[str], m
 @pytest.mark.parametrize("word", ["trainer.learning_rate=null", "model.voxel_fraction=null", "data.points=null"])
 def test_null_is_for_settings_that_mean_something_without_a_value(word: str) -> None:
     with pytest.raises(ConfigurationError, match=r"must be a .* got null"):
-        compose("train", ["object=gear", word])
+        compose(TrainSettings, ["object=gear", word])

@@ -18,6 +18,8 @@ from attentionvote.command.errors import ConfigurationError
 from attentionvote.data.dataset_split import DatasetSplit
 from attentionvote.measurement.dataset_scenes import DatasetScenes
 from attentionvote.workflows.evaluate.job import EvaluationJob
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
+from attentionvote.workflows.settings import WriteDataSettings
 
 WRITTEN = ["object=brick", "simulation=smoke", "simulation.drop_counts=[2,5]", "split=test", "workers=1"]
 
@@ -28,14 +30,14 @@ def ipa(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("ipa")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
-        written = write_data.run(compose("write_data", [*WRITTEN, f"directory={place}", f"root={place}/scenes"]))
+        written = write_data.run(compose(WriteDataSettings, [*WRITTEN, f"directory={place}", f"root={place}/scenes"]))
     return Path(written["directory"])
 
 
 @pytest.fixture
 def brick() -> Any:
     """The part."""
-    return instantiate(compose("evaluate", ["object=brick"]).object)
+    return instantiate(compose(EvaluateSettings, ["object=brick"]).object)
 
 
 def test_scored_scenes_come_without_background_and_thinned(ipa: Path, brick: Any) -> None:
@@ -66,17 +68,17 @@ def test_a_folder_without_data_is_refused(tmp_path: Path, brick: Any) -> None:
 def test_evaluate_measures_on_a_dataset(ipa: Path, export_brick: Any) -> None:
     bundle = export_brick("model")
     words = ["object=brick", f"evaluation.dataset={ipa}", "evaluation.density=2000"]
-    result = evaluate.run(compose("evaluate", words))
+    result = evaluate.run(compose(EvaluateSettings, words))
     assert (result["bundle"], result["scenes"], result["sensor"]) == (bundle.digest, 1, "brick test")
     assert result["frozen"] is None
     assert 0 <= result["figures"]["ap_10"] <= 1
     with pytest.raises(ConfigurationError):
-        evaluate.run(compose("evaluate", [*words[:1], "evaluation.dataset=/nowhere"]))
+        evaluate.run(compose(EvaluateSettings, [*words[:1], "evaluation.dataset=/nowhere"]))
 
 
 def test_scenes_that_the_model_learned_from_are_refused(ipa: Path, brick: Any, export_brick: Any) -> None:
     export_brick("model")
-    job = EvaluationJob.find(compose("evaluate", ["object=brick", f"evaluation.dataset={ipa}"]))
+    job = EvaluationJob.find(compose(EvaluateSettings, ["object=brick", f"evaluation.dataset={ipa}"]))
     dataset = DatasetScenes.find(ipa, brick, 1000).dataset
     learned = DatasetSplit(dataset, dataset.scored_names, brick)
     assert len(job.evaluation_set()) == 1

@@ -11,6 +11,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def run(few_scenes):
     """The verb with a few scenes and some more settings."""
 
     def call(*words: str):
-        return evaluate.run(compose("evaluate", [*few_scenes, *words]))
+        return evaluate.run(compose(EvaluateSettings, [*few_scenes, *words]))
 
     return call
 

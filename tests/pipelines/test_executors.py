@@ -11,17 +11,19 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.command.executors import executor_of
 from attentionvote.execution import LocalPool, RayCluster, SlurmArray
+from attentionvote.workflows.settings import GenerateSettings
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]
 
 
 def test_settings_become_an_executor() -> None:
-    assert executor_of(compose("generate", TINY)) == LocalPool()
-    ray = compose("generate", [*TINY, "executor=ray", "cluster.address=auto", "cluster.gpus=0.5"])
+    assert executor_of(compose(GenerateSettings, TINY)) == LocalPool()
+    ray = compose(GenerateSettings, [*TINY, "executor=ray", "cluster.address=auto", "cluster.gpus=0.5"])
     assert executor_of(ray) == RayCluster("auto", 0.5)
     slurm = ["executor=slurm", "cluster.slurm.system=local", "cluster.slurm.memory_gb=2.5", "cluster.slurm.minutes=9"]
-    assert executor_of(compose("generate", [*TINY, *slurm])) == SlurmArray(Path("outputs/slurm"), "local", 9, 2.5)
+    assert executor_of(compose(GenerateSettings, [*TINY, *slurm])) == SlurmArray(Path("outputs/slurm"), "local", 9, 2.5)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +38,7 @@ def test_settings_become_an_executor() -> None:
 )
 def test_impossible_settings_are_one_sentence(words: list[str], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        compose("train", ["object=brick", "experiment=smoke", *words])
+        compose(TrainSettings, ["object=brick", "experiment=smoke", *words])
 
 
 def test_an_executor_that_cannot_work_is_said_before_any_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -44,26 +46,26 @@ def test_an_executor_that_cannot_work_is_said_before_any_work(monkeypatch: pytes
     with pytest.raises(
         ConfigurationError, match="executor=slurm must be used where jobs can be submitted, but there is"
     ):
-        generate.run(compose("generate", [*TINY, f"root={tmp_path / 'scenes'}", "executor=slurm"]))
+        generate.run(compose(GenerateSettings, [*TINY, f"root={tmp_path / 'scenes'}", "executor=slurm"]))
     assert not (tmp_path / "scenes").exists()
     with pytest.raises(ValueError, match="there is no sbatch here"):
-        find_training(compose("train", ["object=brick", "experiment=smoke", "executor=slurm"]))
+        find_training(compose(TrainSettings, ["object=brick", "experiment=smoke", "executor=slurm"]))
 
 
 def test_where_the_jobs_run_is_no_part_of_what_a_training_is() -> None:
     words = ["object=brick", "experiment=smoke"]
-    plain = find_training(compose("train", words))
+    plain = find_training(compose(TrainSettings, words))
     spread = ["executor=ray", "cluster.address=auto", "cluster.gpus=1.0", "cluster.slurm.minutes=3", "workers=64"]
-    assert find_training(compose("train", [*words, *spread])).directory == plain.directory
-    assert find_training(compose("train", [*words, "seed=1"])).directory != plain.directory
+    assert find_training(compose(TrainSettings, [*words, *spread])).directory == plain.directory
+    assert find_training(compose(TrainSettings, [*words, "seed=1"])).directory != plain.directory
 
 
 @pytest.mark.slow
 def test_generate_through_submitted_jobs_is_the_same_set(tmp_path: Path) -> None:
     one = [*TINY, "splits=[train]"]
-    here = generate.run(compose("generate", [*one, f"root={tmp_path / 'here'}", "workers=1"]))
+    here = generate.run(compose(GenerateSettings, [*one, f"root={tmp_path / 'here'}", "workers=1"]))
     folder = tmp_path / "slurm"
     spread = ["executor=slurm", "cluster.slurm.system=local", f"cluster.slurm.folder={folder}", "workers=2"]
-    there = generate.run(compose("generate", [*one, f"root={tmp_path / 'there'}", *spread]))
+    there = generate.run(compose(GenerateSettings, [*one, f"root={tmp_path / 'there'}", *spread]))
     assert there["sets"]["train"]["digest"] == here["sets"]["train"]["digest"]
     assert list(folder.iterdir()) == []  # what a call needed is removed when it succeeds

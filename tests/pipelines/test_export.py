@@ -18,8 +18,9 @@ import torch
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.inference import load_bundle
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.training.checkpoint import load_trained, save_trained
+from attentionvote.workflows.settings import ExportSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = [
@@ -116,7 +117,7 @@ def again(trained: Path, exported: dict[str, Any], monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(attentionvote.export.onnx_file, "export_graph", never)
     words = [*EXPORT, f"signing_keys={trained}/keys"]
     assert exported["stage"] == "export"
-    return lambda *more: export.run(compose("export", [*words, *more]))
+    return lambda *more: export.run(compose(ExportSettings, [*words, *more]))
 
 
 @pytest.mark.slow
@@ -185,7 +186,7 @@ def test_over_the_limits_only_the_report_is_written(
     (training / "result.json").write_text(json.dumps({"run_id": "f00d", "commit": ""}), encoding="utf-8")
     monkeypatch.setattr(attentionvote.export.onnx_file, "export_graph", lambda *_: stored)
     words = [f"root={trained}/data", f"trained={tmp_path}/train", f"outputs={tmp_path}/export"]
-    cfg = compose("export", [*EXPORT, *words, f"signing_keys={trained}/keys"])
+    cfg = compose(ExportSettings, [*EXPORT, *words, f"signing_keys={trained}/keys"])
     with pytest.raises(ValueError, match=r"must be equal within the limits, but CPU: .*the report is"):
         export.run(cfg)
     written = [p.relative_to(tmp_path / "export").as_posix() for p in (tmp_path / "export").rglob("*") if p.is_file()]
@@ -215,7 +216,7 @@ def two_trainings(tmp_path: Path) -> list[str]:
 )
 def test_a_training_that_cannot_be_meant_is_one_sentence(two_trainings: list[str], word: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        export.run(compose("export", [*two_trainings, word]))
+        export.run(compose(ExportSettings, [*two_trainings, word]))
     assert message in str(caught.value)
 
 
@@ -228,7 +229,7 @@ def test_the_newest_of_several_trainings_is_taken_and_the_others_are_named(
     older.write_text(json.dumps({"run_id": "cafe2", "metrics": {"ap_10": 0.9, "ap_5": 0.8, "ap_2": 0.25}}))
     os.utime(older, (1, 1))
     with caplog.at_level("INFO", logger="attentionvote.export"):
-        assert ExportJob.find(compose("export", two_trainings)).training.name == "aaaa11112222"
+        assert ExportJob.find(compose(ExportSettings, two_trainings)).training.name == "aaaa11112222"
     said = "the newest training is taken, aaaa11112222 (AP unknown); RUN=... takes aaaa33334444 (AP 0.900/0.800/0.250)"
     assert said in caplog.messages
 
@@ -237,13 +238,13 @@ def test_a_damaged_training_is_passed_over(two_trainings: list[str], tmp_path: P
     from attentionvote.workflows.export import ExportJob
 
     (tmp_path / "train" / "brick" / "aaaa11112222" / "result.json").write_text("", encoding="utf-8")
-    assert ExportJob.find(compose("export", two_trainings)).training.name == "aaaa33334444"
+    assert ExportJob.find(compose(ExportSettings, two_trainings)).training.name == "aaaa33334444"
 
 
 def test_one_process_exports_a_part(two_trainings: list[str]) -> None:
     from attentionvote.workflows.export import ExportJob
 
-    job = ExportJob.find(compose("export", two_trainings))
+    job = ExportJob.find(compose(ExportSettings, two_trainings))
     refused = pytest.raises(ConfigurationError, match="another process is at this part's export")
     with job.locked(), refused, job.locked():
         raise AssertionError("two at once")
@@ -252,23 +253,23 @@ def test_one_process_exports_a_part(two_trainings: list[str]) -> None:
 def test_a_place_that_cannot_be_written_is_said_first(two_trainings: list[str], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigurationError, match=r"outputs=.*/file/x cannot be written: Not a directory"):
-        export.run(compose("export", [*two_trainings, f"outputs={tmp_path}/file/x"]))
+        export.run(compose(ExportSettings, [*two_trainings, f"outputs={tmp_path}/file/x"]))
 
 
 def test_a_lost_public_key_comes_back(two_trainings: list[str], tmp_path: Path) -> None:
     from attentionvote.workflows.export import ExportJob
 
-    ExportJob.find(compose("export", two_trainings))
+    ExportJob.find(compose(ExportSettings, two_trainings))
     public = tmp_path / "keys" / "signing.pub"
     text = public.read_bytes()
     public.unlink()
-    ExportJob.find(compose("export", two_trainings))
+    ExportJob.find(compose(ExportSettings, two_trainings))
     assert public.read_bytes() == text
 
 
 def test_a_run_is_named_by_the_beginning_of_its_id_or_folder(two_trainings: list[str]) -> None:
     from attentionvote.workflows.export import ExportJob
 
-    find: Callable[[str], Path] = lambda word: ExportJob.find(compose("export", [*two_trainings, word])).training  # noqa: E731
+    find: Callable[[str], Path] = lambda word: ExportJob.find(compose(ExportSettings, [*two_trainings, word])).training  # noqa: E731
     assert find("run=cafe1").name == "aaaa11112222"
     assert find("run=aaaa3").name == "aaaa33334444"

@@ -17,11 +17,13 @@ from hydra.utils import instantiate
 from attentionvote.command.configuration import compose
 from attentionvote.evaluation.by_part import COUNTS
 from attentionvote.inference import PoseEstimator, load_bundle
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import PartSet
 from attentionvote.simulation.scene_set import SceneSet
 from attentionvote.training.checkpoint import save_trained
+from attentionvote.workflows.settings import GenerateSettings
 from attentionvote.workflows.train.network import described, network_arguments
+from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 OBJECT = ["object=industrial", "~object.parts.vertical_bearing_pedestal"]
@@ -52,7 +54,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scenes and a training of a small network that knows nothing but where its votes begin."""
     folder = tmp_path_factory.mktemp("trained")
     python("generate.py", *SCENES, "splits=[test]", "workers=1", folder=folder)
-    cfg = compose("train", [*OBJECT, "experiment=compact", *NETWORK])
+    cfg = compose(TrainSettings, [*OBJECT, "experiment=compact", *NETWORK])
     parts: PartSet = instantiate(cfg.object)
     network = {k: v for k, v in network_arguments(cfg.model, parts).items() if k != "_target_"}
     torch.manual_seed(0)
@@ -75,7 +77,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_model_of_two_parts_becomes_a_bundle_and_is_evaluated(trained: Path) -> None:
     exported = python("export.py", *OBJECT, "limits.scenes=2", "scenes=4", "golden=1", "workers=1", folder=trained)
     bundle = load_bundle(trained / exported["bundle"], trained / "keys" / "signing.pub")
-    cfg = compose("generate", OBJECT)
+    cfg = compose(GenerateSettings, OBJECT)
     parts: PartSet = instantiate(cfg.object)
     assert bundle.card.classes == NAMES
     assert [part.digest for part in bundle.card.parts] == [part.digest for part in parts.parts]

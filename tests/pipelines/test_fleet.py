@@ -26,8 +26,11 @@ from attentionvote.simulation.scene_set import generate_scene_set
 from attentionvote.simulation.scene_spec import scene_set_directory
 from attentionvote.workflows.export import ExportJob
 from attentionvote.workflows.fleet import board as fleet_board
+from attentionvote.workflows.fleet.settings import FleetSettings
+from attentionvote.workflows.settings import ExportSettings
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.preset import preset_of_workers
+from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [
@@ -44,7 +47,7 @@ TINY = [
 @pytest.fixture
 def job(tmp_path: Path) -> Any:
     """The training of the brick on tiny scene sets."""
-    return find_training(compose("train", ["object=brick", *TINY, f"outputs={tmp_path / 'train'}"]))
+    return find_training(compose(TrainSettings, ["object=brick", *TINY, f"outputs={tmp_path / 'train'}"]))
 
 
 def test_all_is_every_part_whose_mesh_is_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -90,20 +93,20 @@ def test_words_of_the_training_are_handed_on_and_those_of_the_fleet_are_not() ->
 @pytest.mark.parametrize(("gpus", "preset"), [("1.0", "gpu"), ("0", "compact")])
 def test_on_a_cluster_the_jobs_choose_the_preset_not_the_submitting_machine(gpus: str, preset: str) -> None:
     words = ["executor=slurm", f"cluster.gpus={gpus}"]
-    assert preset_of_workers(compose("fleet", words), words) == [f"experiment={preset}"]
-    assert preset_of_workers(compose("fleet", words), [*words, "experiment=paper"]) == []
+    assert preset_of_workers(compose(FleetSettings, words), words) == [f"experiment={preset}"]
+    assert preset_of_workers(compose(FleetSettings, words), [*words, "experiment=paper"]) == []
 
 
 def test_exports_and_evaluations_lie_beside_the_trainings() -> None:
     said = ["outputs=o/train", "root=d", "tracking.store=s.db", "export=['signing_keys=k','scenes=40']"]
-    words, places = fleet.words_of_verbs(compose("fleet", said), ["seed=3"], "brick")
+    words, places = fleet.words_of_verbs(compose(FleetSettings, said), ["seed=3"], "brick")
     assert words["train"] == ("seed=3",)
     assert words["export"] == ("trained=o/train", "root=d", "outputs=o/export", "signing_keys=k", "scenes=40")
     expected = ("root=d", "bundles=o/export", "outputs=o/evaluate", "tracking.store=s.db", "trusted_key=k/signing.pub")
     assert words["evaluate"] == expected
     assert places == {"bundles": Path("o/export")}
     with pytest.raises(ConfigurationError, match="there is no setting 'scnes', did you mean 'scenes'"):
-        fleet.words_of_verbs(compose("fleet", ["export=['scnes=40']"]), [], "brick")
+        fleet.words_of_verbs(compose(FleetSettings, ["export=['scnes=40']"]), [], "brick")
 
 
 def test_data_is_stale_when_the_configuration_would_generate_other_scenes(job: Any, tmp_path: Path) -> None:
@@ -204,11 +207,11 @@ def test_a_fleet_goes_on_with_the_real_verbs_and_one_part_fails(export_brick: An
     words = ["objects='gear,brick'", *TINY, "outputs=outputs/train", "root=data", "tracking.store=mlflow.db"]
     words += ["export=['scenes=32']", f"evaluate={few}"]
     bundle = export_brick("model", "feed" * 8)
-    trained = find_training(compose("train", ["object=brick", *TINY, "outputs=outputs/train"])).directory
+    trained = find_training(compose(TrainSettings, ["object=brick", *TINY, "outputs=outputs/train"])).directory
     trained.mkdir(parents=True)
     (trained / "model.ckpt").write_bytes(b"weights")
     write_json(trained / "result.json", {"stage": "train", "object": "brick", "run_id": "feed" * 8})
-    ExportJob.find(compose("export", ["object=brick", "scenes=32"])).finish(bundle, {})
+    ExportJob.find(compose(ExportSettings, ["object=brick", "scenes=32"])).finish(bundle, {})
     (tmp_path / "data" / "scenes").mkdir(parents=True)
     (tmp_path / "data" / "scenes" / "gear").touch()
     done = subprocess.run(

@@ -13,12 +13,13 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.part import Part
 from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.workflows.settings import GenerateSettings
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]", "workers=1"]
 
 
 def run(root: Path, *overrides: str) -> dict:
-    return generate.run(compose("generate", [*TINY, f"root={root}", *overrides]))
+    return generate.run(compose(GenerateSettings, [*TINY, f"root={root}", *overrides]))
 
 
 def test_every_split_is_generated_once(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_the_presets_are_valid_and_spell_out_the_defaults(simulation: str) -> No
 
     from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
 
-    cfg = compose("generate", ["object=brick", f"simulation={simulation}"])
+    cfg = compose(GenerateSettings, ["object=brick", f"simulation={simulation}"])
     part = Part("box", np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]), 1.0)
     specs = scene_set_specs(part, OmegaConf.to_container(cfg.simulation))  # type: ignore[arg-type]
     assert set(specs) == {"train", "val", "test"}

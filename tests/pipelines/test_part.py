@@ -19,6 +19,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.simulation.symmetry_detection import symmetry_residual
+from attentionvote.workflows.settings import PartSettings
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def mesh_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(mesh: Path, folder: Path, *words: str) -> dict:
     places = [f"parts={folder}/parts", f"objects={folder}/object"]
-    return part.run(compose("part", [f"mesh='{mesh}'", *places, *words]))
+    return part.run(compose(PartSettings, [f"mesh='{mesh}'", *places, *words]))
 
 
 def test_a_file_becomes_an_object_that_loads(mesh_file: Path, tmp_path: Path) -> None:

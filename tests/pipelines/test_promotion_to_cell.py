@@ -23,6 +23,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.inference.client.pose_client import PoseClient
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import serve
+from attentionvote.workflows.settings import PromoteSettings, RollbackSettings
 
 
 @contextlib.contextmanager
@@ -97,7 +98,7 @@ def test_a_running_cell_follows_promotion_and_rollback_and_outlives_the_registry
             return export_brick(name, run.id, run.commit)
 
         def promoted():
-            return promote.run(compose("promote", [*few_scenes, *easy_gates, f"tracking.store={server.url}"]))
+            return promote.run(compose(PromoteSettings, [*few_scenes, *easy_gates, f"tracking.store={server.url}"]))
 
         first = made_by_a_training("one")
         assert promoted()["version"] == 1
@@ -106,7 +107,7 @@ def test_a_running_cell_follows_promotion_and_rollback_and_outlives_the_registry
             second = made_by_a_training("two")
             assert promoted()["champion"] == 2
             customer.wait_for(second.digest)
-            back = rollback.run(compose("rollback", ["object=brick", f"tracking.store={server.url}"]))
+            back = rollback.run(compose(RollbackSettings, ["object=brick", f"tracking.store={server.url}"]))
             assert back["champion"] == 1
             customer.wait_for(first.digest)
             os.killpg(server.process.pid, signal.SIGKILL)

@@ -18,6 +18,7 @@ import score
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.evaluation import write_ground_truth, write_results
+from attentionvote.workflows.settings import ScoreSettings
 
 # threshold_scale: AP, F1, MAP, R99, R50, TP, FP, FN
 BUNNY = {
@@ -38,7 +39,7 @@ def words(folder: Path, *more: str) -> list[str]:
 
 
 def run(folder: Path, *more: str) -> dict:
-    return score.run(compose("score", words(folder, *more)))
+    return score.run(compose(ScoreSettings, words(folder, *more)))
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from bop_split import HEADER, BopSplit, csv_row
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.workflows.settings import ScoreSettings
 
 
 def words(split: BopSplit, *more: str) -> list[str]:
@@ -21,7 +22,7 @@ def words(split: BopSplit, *more: str) -> list[str]:
 
 
 def run(split: BopSplit, *more: str) -> dict:
-    return score.run(compose("score", words(split, *more)))
+    return score.run(compose(ScoreSettings, words(split, *more)))
 
 
 def exact_rows(split: BopSplit) -> list[str]:

@@ -23,7 +23,9 @@ from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, resolve_store
 from attentionvote.workflows.sweep.job import SweepJob
 from attentionvote.workflows.sweep.report import MARK, check_save_as, experiment_text
+from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 EPOCHS = 4
@@ -47,14 +49,14 @@ def words(tmp_path: Path) -> list[str]:
 
 def sweep_of(words: list[str]) -> SweepJob:
     """The sweep that the words mean, its study open."""
-    job = SweepJob(compose("sweep", words), sweep.training_words(words), "smoke")
+    job = SweepJob(compose(SweepSettings, words), sweep.training_words(words), "smoke")
     job.folder.mkdir(parents=True, exist_ok=True)
     job.open()
     return job
 
 
 def run(words: list[str]) -> dict[str, Any]:
-    return json.loads(json.dumps(sweep.run(compose("sweep", words), words)))
+    return json.loads(json.dumps(sweep.run(compose(SweepSettings, words), words)))
 
 
 @pytest.mark.slow
@@ -131,7 +133,7 @@ def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp
     conf = tmp_path / "conf"
     shutil.copytree(CONF, conf)
     shutil.copy(result["experiment"], conf / "experiment" / "rod.yaml")
-    found = find_training(compose("train", ["object=brick", "experiment=rod"], conf))
+    found = find_training(compose(TrainSettings, ["object=brick", "experiment=rod"], conf))
     assert found.directory.name == job.directory(best["values"]).name
 
 
@@ -190,7 +192,7 @@ def test_an_impossible_sweep_is_refused_before_any_work(
 def test_the_study_is_named_by_what_it_searches_not_by_how_it_is_run(words: list[str]) -> None:
     def name(*more: str) -> str:
         said = [*words, *more]
-        return SweepJob(compose("sweep", said), sweep.training_words(said), "smoke").name
+        return SweepJob(compose(SweepSettings, said), sweep.training_words(said), "smoke").name
 
     same = name()
     assert same.startswith("brick-smoke-")
@@ -211,7 +213,7 @@ def test_trials_of_one_machine_share_its_gpus(words: list[str], monkeypatch: pyt
 
     def gpu(slot: int, *more: str) -> str | None:
         said = [*words, *more]
-        job = SweepJob(compose("sweep", said), sweep.training_words(said), "smoke")
+        job = SweepJob(compose(SweepSettings, said), sweep.training_words(said), "smoke")
         return job._environment(9, slot).get("CUDA_VISIBLE_DEVICES")
 
     assert [gpu(slot, "workers=3") for slot in range(3)] == ["4", "6", "4"]
@@ -223,7 +225,7 @@ def test_a_file_is_no_study_for_several_machines(words: list[str], caplog: pytes
     def warned(*more: str) -> bool:
         caplog.clear()
         said = [*words, *more]
-        SweepJob(compose("sweep", said), sweep.training_words(said), "smoke")
+        SweepJob(compose(SweepSettings, said), sweep.training_words(said), "smoke")
         return "the study is an SQLite file" in caplog.text
 
     assert warned("executor=ray", "cluster.address=auto")
@@ -245,8 +247,8 @@ def test_an_experiment_says_what_the_sweep_was_given(tmp_path: Path) -> None:
     conf = tmp_path / "conf"
     shutil.copytree(CONF, conf)
     (conf / "experiment" / "mine.yaml").write_text(text, encoding="utf-8")
-    got = compose("train", ["object=brick", "experiment=mine"], conf)
-    said = compose("train", [*given, *(f"{k}={json.dumps(v)}" for k, v in values.items())])
+    got = compose(TrainSettings, ["object=brick", "experiment=mine"], conf)
+    said = compose(TrainSettings, [*given, *(f"{k}={json.dumps(v)}" for k, v in values.items())])
     for section in ("model", "data", "trainer", "loss", "simulation"):
         assert got[section] == said[section], section
     assert got.outputs != "x"

@@ -11,14 +11,16 @@ from omegaconf import DictConfig, OmegaConf
 from attentionvote.command.conf_folder import CONF, choices
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.sweep.space import parse_space
+from attentionvote.workflows.train.settings import TrainSettings
 
 RATE = {"name": "trainer.learning_rate", "kind": "float", "low": 0.001, "high": 0.01, "log": True}
 
 
 @pytest.fixture(scope="module")
 def base() -> DictConfig:
-    return compose("train", ["object=brick", "experiment=smoke"])
+    return compose(TrainSettings, ["object=brick", "experiment=smoke"])
 
 
 @pytest.mark.parametrize(
@@ -89,7 +91,7 @@ def test_every_kind_gives_values_and_words_that_compose(base: DictConfig) -> Non
         seen |= {str(values["model.merge_fraction"]), str(values["trainer.schedule.milestones"])}
         study.tell(trial, 0.0)
     assert seen == {"None", "0.1", "[2, 3]", "[4, 5]"}
-    cfg = compose("train", ["object=brick", "experiment=smoke", *(s.word(values[s.name]) for s in space)])
+    cfg = compose(TrainSettings, ["object=brick", "experiment=smoke", *(s.word(values[s.name]) for s in space)])
     assert {
         s.name: OmegaConf.to_container(OmegaConf.create([OmegaConf.select(cfg, s.name)]))[0] for s in space
     } == values
@@ -100,6 +102,6 @@ def test_every_kind_gives_values_and_words_that_compose(base: DictConfig) -> Non
 @pytest.mark.parametrize("name", choices("sweep"))
 def test_the_spaces_of_conf_fit_the_preset_of_their_name(name: str) -> None:
     assert (CONF / "experiment" / f"{name}.yaml").is_file()
-    space = OmegaConf.to_container(compose("sweep", ["object=brick", f"sweep={name}"]).sweep.space)
+    space = OmegaConf.to_container(compose(SweepSettings, ["object=brick", f"sweep={name}"]).sweep.space)
     assert isinstance(space, list)
-    assert len(parse_space(space, compose("train", ["object=brick", f"experiment={name}"]))) == len(space)
+    assert len(parse_space(space, compose(TrainSettings, ["object=brick", f"experiment={name}"]))) == len(space)

@@ -29,6 +29,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.drawing import figures, scene_pictures
 from attentionvote.tracking.run_opening import start_run
+from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [
@@ -71,7 +72,7 @@ def alone() -> Iterator[None]:
 
 
 def run(words: list[str], *more: str) -> dict[str, Any]:
-    return json.loads(json.dumps(train.run(compose("train", [*words, *more]))))
+    return json.loads(json.dumps(train.run(compose(TrainSettings, [*words, *more]))))
 
 
 @pytest.fixture
@@ -262,7 +263,7 @@ def test_an_end_without_validation_keeps_the_last_weights(words: list[str]) -> N
 def test_one_process_a_training(words: list[str], verb: Verb) -> None:
     from attentionvote.workflows.train.job import find_training
 
-    with find_training(compose("train", words)).locked():
+    with find_training(compose(TrainSettings, words)).locked():
         process = verb(words)
         out, err = process.communicate(timeout=120)
     assert (process.returncode, out) == (2, "")

@@ -24,6 +24,7 @@ from attentionvote.simulation.sensor import Sensor
 from attentionvote.training.checkpoint import load_trained
 from attentionvote.workflows.fleet import board as fleet_board
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 from attentionvote.workflows.train.tracking import DATASET
 
 TINY = [
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("quick_training")
 
 @pytest.fixture(scope="module")
 def brick() -> Part:
-    return load_part("brick", "builtin:brick", diameter=compose("train", TINY).object.diameter)
+    return load_part("brick", "builtin:brick", diameter=compose(TrainSettings, TINY).object.diameter)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def words(store: str, tmp_path: Path) -> list[str]:
 
 
 def run(words: list[str], *more: str) -> dict[str, Any]:
-    return json.loads(json.dumps(train.run(compose("train", [*words, *more]))))
+    return json.loads(json.dumps(train.run(compose(TrainSettings, [*words, *more]))))
 
 
 def test_a_training_on_held_out_cycles_is_recorded(
@@ -71,7 +72,7 @@ def test_a_training_on_held_out_cycles_is_recorded(
     assert "brick: 4/2/2 scenes (train/val/test)" in caplog.text
     assert (result["steps"], result["test_scenes"]) == (4, 2)
     _, metadata = load_trained(result["model"])
-    job = find_training(compose("train", said))
+    job = find_training(compose(TrainSettings, said))
     assert job.dataset is not None
     digests = {split: scenes.digest for split, scenes in job.dataset.splits.items()}
     assert metadata["data"] == digests | job.dataset.evidence
@@ -94,7 +95,7 @@ def test_a_training_on_held_out_cycles_is_recorded(
 
 def test_bop_and_own_splits_are_trained_on(data: Path, words: list[str], tmp_path: Path) -> None:
     plain, held, bop, own = (
-        find_training(compose("train", [*words, word]))
+        find_training(compose(TrainSettings, [*words, word]))
         for word in ("seed=0", "data.held_out.val=0.1", f"data.dataset={data}/bop", f"data.dataset={data}/ipa")
     )
     assert plain.dataset is None
@@ -105,7 +106,7 @@ def test_bop_and_own_splits_are_trained_on(data: Path, words: list[str], tmp_pat
     result = run(words, f"data.dataset={data}/bop", "data.sensor.preset=none")
     assert result["steps"] == 4
     assert bop.dataset is not None
-    settings = CloudSettings(Sensor("none"), 1500, 800, compose("train", words).data.normal_neighbors)
+    settings = CloudSettings(Sensor("none"), 1500, 800, compose(TrainSettings, words).data.normal_neighbors)
     key = settings.key(bop.dataset.splits["train"].digest)[:16]
     clouds = Clouds(tmp_path / "root" / "clouds" / "brick" / key, bop.dataset.splits["train"])
     assert [clouds.count(i) for i in range(4)] == [800] * 4

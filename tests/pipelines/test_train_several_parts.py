@@ -14,6 +14,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.training.checkpoint import load_trained
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 
 # The set without its third part: the rod and the slider bearing pedestal.
 TWO = [
@@ -40,20 +41,20 @@ def words(tmp_path: Path) -> list[str]:
 def test_the_classes_are_the_parts_and_no_other_number_is_taken(words: list[str], tmp_path: Path) -> None:
     message = r"model.classes must be the number of parts of industrial \(2\), got 3: leave it out, the object decides"
     with pytest.raises(ConfigurationError, match=message):
-        train.run(compose("train", [*words, "model.classes=3"]))
+        train.run(compose(TrainSettings, [*words, "model.classes=3"]))
     with pytest.raises(ConfigurationError, match=r"number of parts of brick \(1\), got 2"):
-        train.run(compose("train", [*words[2:], "object=brick", "model.classes=2"]))
+        train.run(compose(TrainSettings, [*words[2:], "object=brick", "model.classes=2"]))
     assert not (tmp_path / "data").exists()
-    job = find_training(compose("train", words))
+    job = find_training(compose(TrainSettings, words))
     assert [part.name for part in job.part.parts] == NAMES
-    assert find_training(compose("train", [*words, "model.classes=2"])).directory == job.directory
+    assert find_training(compose(TrainSettings, [*words, "model.classes=2"])).directory == job.directory
     assert job.directory.parent.name == "industrial"
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_bin_of_two_parts_from_drops_to_figures_of_each(words: list[str]) -> None:
-    result: dict[str, Any] = json.loads(json.dumps(train.run(compose("train", words))))
+    result: dict[str, Any] = json.loads(json.dumps(train.run(compose(TrainSettings, words))))
     metrics = result["metrics"]
     told = {"ap_10", "ap_2", "precision_10", "recall_10", "add_precision_10", "add_recall_10"}
     assert (result["object"], result["steps"], result["test_scenes"]) == ("industrial", 8, 2)
@@ -67,9 +68,11 @@ def test_a_bin_of_two_parts_from_drops_to_figures_of_each(words: list[str]) -> N
     assert metadata["part"]["diameter"] == 0.143
     assert model.diameter == 0.143
     # Thin parts that lie on each other are not merged: the pedestal is the smaller one, and so is what is merged.
-    thinnest = min(np.ptp(part.vertices, axis=0).min() for part in find_training(compose("train", words)).part.parts)
+    thinnest = min(
+        np.ptp(part.vertices, axis=0).min() for part in find_training(compose(TrainSettings, words)).part.parts
+    )
     assert model.merge_radius is not None
     assert model.merge_radius <= 0.5 * thinnest + 1e-9
-    again = train.run(compose("train", words))  # complete: not repeated
+    again = train.run(compose(TrainSettings, words))  # complete: not repeated
     assert again is not None
     assert again["run_id"] == result["run_id"]

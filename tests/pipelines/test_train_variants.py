@@ -12,6 +12,7 @@ from tiny_training import TINY_TRAINING
 
 from attentionvote.command.configuration import compose
 from attentionvote.training.checkpoint import load_trained
+from attentionvote.workflows.train.settings import TrainSettings
 
 # An epoch has the steps of the smoke preset's (3 of 4 scenes); scenes, clouds and network are smaller.
 ONE_EPOCH = [
@@ -46,7 +47,9 @@ def test_a_variant_trains_an_epoch(
     places: list[str], fusion_kind: str, proposal_source: str, more: dict[str, str]
 ) -> None:
     chosen = {"model.fusion_kind": fusion_kind, "model.proposal_source": proposal_source, **more}
-    result = train.run(compose("train", [*ONE_EPOCH, *places, *(f"{key}={value}" for key, value in chosen.items())]))
+    result = train.run(
+        compose(TrainSettings, [*ONE_EPOCH, *places, *(f"{key}={value}" for key, value in chosen.items())])
+    )
     assert result is not None
     assert (result["steps"], result["test_scenes"]) == (3, 3)
     assert {"ap_10", "add_recall_10", "proposal_recall", "proposal_repeats"} <= set(result["metrics"])

@@ -25,6 +25,7 @@ from tiny_training import TINY_TRAINING
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.workflows.train.processes import Place, first_speaks, refuse_grid
+from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
@@ -79,7 +80,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[str]], dic
         for name in ("scene_picture", "loss_figure", "precision_recall_figure", "ap_threshold_figure"):
             monkeypatch.setattr(module, name, lambda *_, **__: b"picture", raising=False)
     threads, level = torch.get_num_threads(), logging.getLogger("lightning.pytorch").level
-    yield lambda words: json.loads(json.dumps(train.run(compose("train", words))))
+    yield lambda words: json.loads(json.dumps(train.run(compose(TrainSettings, words))))
     torch.set_num_threads(threads)
     logging.getLogger("lightning.pytorch").setLevel(level)
 

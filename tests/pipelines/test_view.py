@@ -13,6 +13,7 @@ from attentionvote.command.errors import ConfigurationError
 from attentionvote.simulation import scene_set
 from attentionvote.simulation.part_files import load_part
 from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
+from attentionvote.workflows.settings import ViewSettings
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.train=2", "simulation.drop_counts=[1,2]"]
 TINY += [f"simulation.camera.camera.{key}" for key in ("width=344", "height=257", "fx=567.0", "fy=567.0")]
@@ -21,7 +22,7 @@ TINY += ["simulation.camera.camera.cx=172.0", "simulation.camera.camera.cy=128.5
 
 def run(directory: Path, *overrides: str) -> dict:
     words = [*TINY, f"root={directory}/scenes", f"output={directory}/view", "max_points=2000", *overrides]
-    return view.run(compose("view", words))
+    return view.run(compose(ViewSettings, words))
 
 
 def test_a_scene_looks_the_same_before_and_after_its_set_exists(tmp_path: Path) -> None:
@@ -34,7 +35,7 @@ def test_a_scene_looks_the_same_before_and_after_its_set_exists(tmp_path: Path) 
     assert before["parts"] == 2
     assert not (tmp_path / "scenes").exists()
     part = load_part("brick", "builtin:brick")
-    settings = OmegaConf.to_container(compose("view", TINY).simulation)
+    settings = OmegaConf.to_container(compose(ViewSettings, TINY).simulation)
     spec = scene_set_specs(part, settings)["train"]  # type: ignore[arg-type]
     directory = scene_set_directory(tmp_path / "scenes", "brick", spec)
     scene_set.generate_scene_set(part, spec, directory, progress=False)

@@ -16,6 +16,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.datasets import open_datasets
 from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.workflows.settings import CheckDataSettings, WriteDataSettings
 
 TINY = ["object=brick", "simulation=smoke", "simulation.cycles.test=1", "simulation.drop_counts=[2,5]", "workers=1"]
 TINY += [f"simulation.camera.camera.{key}" for key in ("width=344", "height=257", "fx=567.0", "fy=567.0")]
@@ -30,11 +31,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write(root: Path, target: Path, *words: str) -> dict[str, Any]:
-    return write_data.run(compose("write_data", [*TINY, f"root={root}", f"directory={target}", *words]))
+    return write_data.run(compose(WriteDataSettings, [*TINY, f"root={root}", f"directory={target}", *words]))
 
 
 def check(directory: Path, *words: str) -> dict[str, Any]:
-    return check_data.run(compose("check_data", [f"directory={directory}", *words]))
+    return check_data.run(compose(CheckDataSettings, [f"directory={directory}", *words]))
 
 
 def records(root: Path) -> list[Any]:
@@ -135,7 +136,7 @@ def test_the_check_refuses_what_is_wrong_and_what_is_no_dataset(
     with pytest.raises(ConfigurationError, match=r"must hold a dataset of a known layout, got none of them .IPA:"):
         check(root)
     with pytest.raises(ConfigurationError, match=r"directory must be given, e\.g\. directory=data/ipa"):
-        check_data.run(compose("check_data", []))
+        check_data.run(compose(CheckDataSettings, []))
     for name in ("scene_camera.json", "scene_gt.json"):
         (tmp_path / name).write_text("{")
     with pytest.raises(Refused, match=r"scene_camera.json: the file must be JSON"):

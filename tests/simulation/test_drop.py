@@ -15,7 +15,8 @@ from attentionvote.geometry.pose import apply
 from attentionvote.part import Part
 from attentionvote.simulation import drop
 from attentionvote.simulation.decomposition import Hulls, convex_hulls
-from attentionvote.simulation.drop import BinSettings, DropSettings, Solid, drop_parts
+from attentionvote.simulation.drop import Solid, drop_parts
+from attentionvote.simulation.drop_settings import BinSettings, DropSettings
 from attentionvote.simulation.mass import mass_properties
 from attentionvote.simulation.part_files import load_part
 

@@ -21,7 +21,7 @@ from attentionvote.geometry.pose import inverse
 from attentionvote.part import Part
 from attentionvote.simulation import cycle_pool, scene_set
 from attentionvote.simulation.camera import Camera, CameraSettings
-from attentionvote.simulation.drop import DropSettings
+from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.scene_record import SceneRecord
 from attentionvote.simulation.scene_set import SceneSet, content_digest, generate_scene_set
 from attentionvote.simulation.scene_spec import SceneSetSpec

@@ -10,7 +10,7 @@ import pytest
 
 from attentionvote.part import Part
 from attentionvote.simulation.camera import Camera, CameraSettings
-from attentionvote.simulation.drop import BinSettings, DropSettings
+from attentionvote.simulation.drop_settings import BinSettings, DropSettings
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
 
 SPEC = SceneSetSpec("0" * 64, "train", 10)

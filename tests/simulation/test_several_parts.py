@@ -17,7 +17,7 @@ from attentionvote.part import Part, PartSet
 from attentionvote.simulation import scene_set
 from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.cycle import draw_part_ids, solids_of
-from attentionvote.simulation.drop import BinSettings
+from attentionvote.simulation.drop_settings import BinSettings
 from attentionvote.simulation.part_files import load_part, load_parts
 from attentionvote.simulation.raycast import BinSurface, PartCaster
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records

@@ -145,7 +145,7 @@ def test_a_verb_says_one_sentence_before_its_work(server, as_user, tmp_path, cap
     as_user("admin", "not-the-password")
     settings = [f"tracking.store={server.url}", f"root={tmp_path}/data", f"outputs={tmp_path}/outputs"]
     with pytest.raises(ConnectionError) as caught:
-        train.run(compose("train", ["object=connecting_rod", "experiment=smoke", *settings]))
+        train.run(compose(TrainSettings, ["object=connecting_rod", "experiment=smoke", *settings]))
     sentence = str(caught.value)
     assert sentence.startswith(f"tracking server {server.url} must be given user and password")
     assert "not-the-password" not in sentence + caplog.text

@@ -18,7 +18,8 @@ import torch
 from attentionvote.data.samples import Batch, collate
 from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.model import AttentionVote, find_neighborhoods
+from attentionvote.model.neighborhoods import find_neighborhoods
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.training.processes import joined
 

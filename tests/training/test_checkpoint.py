@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.training.checkpoint import (
     FORMAT,
     KEY,

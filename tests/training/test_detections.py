@@ -10,7 +10,7 @@ import torch
 
 from attentionvote.data.samples import Batch
 from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix
-from attentionvote.model import Predictions
+from attentionvote.model.predictions import Predictions
 from attentionvote.training.detections import scene_results
 
 

@@ -13,14 +13,16 @@ from torch import Tensor
 from attentionvote.data.samples import Batch
 from attentionvote.geometry.pose import quaternion_from_matrix
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.model import AttentionVote, Neighborhoods, find_neighborhoods
+from attentionvote.model.neighborhoods import Neighborhoods, find_neighborhoods
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part, PartSet
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.module import PoseTraining
 from attentionvote.training.part_poses import PartPoses
 from attentionvote.training.pictures import picture_inputs
 from attentionvote.training.pose_loss import RotationLoss, SymmetricPose
 from attentionvote.training.schedule import Schedule
+from attentionvote.training.settings import LossSettings
 from attentionvote.training.step import batch_loss
 
 WEIGHTS = dict.fromkeys(AttentionVoteLoss.TERMS, 1.0)

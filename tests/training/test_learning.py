@@ -12,7 +12,8 @@ from attentionvote.data.samples import collate
 from attentionvote.evaluation import PoseMetric, average_precision
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.training.detections import scene_results
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
+from attentionvote.training.settings import LossSettings
 from attentionvote.training.step import batch_loss
 
 WEIGHTS = {"vote": 2.0, "vote_rotation": 0.5, "center": 1.0, "rotation": 1.0, "confidence": 1.0, "refined": 1.0}

@@ -13,9 +13,13 @@ from attentionvote.data.samples import Batch, collate
 from attentionvote.evaluation import PoseMetric
 from attentionvote.geometry.pose import canonical_quaternion, quaternion_from_matrix, rotation_about, transform
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.model import AttentionVote, Peaks, Poses, Votes, find_neighborhoods
+from attentionvote.model.neighborhoods import find_neighborhoods
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.predictions import Poses, Votes
+from attentionvote.model.proposals import Peaks
 from attentionvote.part import Part
-from attentionvote.training.losses import Assignment, AttentionVoteLoss, LossSettings, masked_mean
+from attentionvote.training.losses import Assignment, AttentionVoteLoss, masked_mean
+from attentionvote.training.settings import LossSettings
 from attentionvote.training.step import batch_loss
 
 WEIGHTS = dict.fromkeys(AttentionVoteLoss.TERMS, 1.0)

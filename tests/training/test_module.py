@@ -17,13 +17,14 @@ from torch.utils.data import DataLoader
 
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.scene import Scene
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.module import PoseTraining
 from attentionvote.training.pictures import ScenePictures, picture_inputs
 from attentionvote.training.schedule import Schedule
+from attentionvote.training.settings import LossSettings
 
 ARGUMENTS: dict[str, Any] = {
     "diameter": 0.075,

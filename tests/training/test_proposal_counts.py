@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from attentionvote.data.samples import Batch
-from attentionvote.model import Predictions
+from attentionvote.model.predictions import Predictions
 from attentionvote.training.proposal_counts import ProposalCounts, proposal_counts, proposal_figures
 
 

@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from attentionvote.data.samples import Batch, collate
 from attentionvote.geometry.pose import quaternion_from_matrix
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.model import Peaks, Poses, Votes
+from attentionvote.model.predictions import Poses, Votes
+from attentionvote.model.proposals import Peaks
 from attentionvote.part import Part, PartSet
-from attentionvote.training.losses import Assignment, AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import Assignment, AttentionVoteLoss
 from attentionvote.training.part_poses import PartPoses
 from attentionvote.training.pose_loss import RotationLoss, SymmetricPose
+from attentionvote.training.settings import LossSettings
 from attentionvote.training.step import batch_loss
 
 WEIGHTS = dict.fromkeys(AttentionVoteLoss.TERMS, 1.0)

@@ -13,12 +13,14 @@ from torch import Tensor
 from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.geometry.pose import transform
-from attentionvote.model import AttentionVote, Neighborhoods
+from attentionvote.model.neighborhoods import Neighborhoods
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.module import PoseTraining
 from attentionvote.training.processes import summed
 from attentionvote.training.schedule import Schedule
+from attentionvote.training.settings import LossSettings
 from attentionvote.training.step import batch_loss
 from attentionvote.training.synced_norm import RowNormSync
 

@@ -2,8 +2,3 @@
 
 OpenCV is imported only when a detector is made; it comes with the extra ``benchmark``.
 """
-
-from attentionvote.baselines.opencv import check_opencv
-from attentionvote.baselines.ppf import Detections, PpfDetector, PpfSettings
-
-__all__ = ["Detections", "PpfDetector", "PpfSettings", "check_opencv"]

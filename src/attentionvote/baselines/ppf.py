@@ -23,9 +23,7 @@ The method has patents (EP 2385483, US 8830229); it is here to be measured, not 
 
 from __future__ import annotations
 
-import difflib
 import math
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -35,11 +33,11 @@ from scipy.spatial import cKDTree
 
 from attentionvote.baselines.hypotheses import apart, fits, merged, placed
 from attentionvote.baselines.opencv import surface_matching, thinned, threads
+from attentionvote.baselines.settings import PpfSettings
 from attentionvote.geometry.pose import transform
 from attentionvote.part import Part
 
 Array = NDArray[np.float64]
-SCORES = ("votes", "fit")
 _MODEL_POINTS, _FIT_POINTS = 30_000, 1_500
 _LEAST_POINTS = 30  # fewer determine no pose
 _MOST_CELLS = 200  # along an edge of OpenCV's grid: 200 MB
@@ -52,66 +50,6 @@ class Detections(NamedTuple):
 
     camera_from_part: Array
     scores: Array
-
-
-@dataclass(frozen=True)
-class PpfSettings:
-    """How a bin is searched; lengths are shares of D.
-
-    The defaults were chosen on two validation scenes of the connecting rod (14 and 22 parts, 0.3 mm of noise). Average
-    precision at 10 % D: as voted .43, with ICP and ``fit`` .75; with sampling .07, which votes in about a third of the
-    time, .31 and .72. 40 angles lost, and so did half the reference points. A ``fit`` of .3 is a fair working point.
-
-    Args:
-        sampling: voxel to which model and scene are thinned, and OpenCV's relative sampling step.
-        angles: steps of a full turn that angles are quantised in (OpenCV's numAngles).
-        reference_step: every so-many-th scene point votes for a pose.
-        merge_distance, merge_degrees: poses nearer to each other than both are one hypothesis.
-        hypotheses: most of them that are looked at further, those with most votes.
-        icp_iterations: of OpenCV's ICP; 0 leaves the poses as voted.
-        icp_points: most points of the scene that ICP sees.
-        score: ``votes`` (the sum of a hypothesis's votes, as OpenCV and the paper rank) or ``fit`` (share of the
-            model points facing the camera that have a scene point near; a few lines more, as users of ICP write).
-        fit_distance: near means within it.
-        separation: of two poses with centres nearer than this only the better one is given.
-
-    Raises:
-        ValueError: on an impossible value.
-    """
-
-    sampling: float = 0.05
-    angles: int = 30
-    reference_step: int = 5
-    merge_distance: float = 0.1
-    merge_degrees: float = 30.0
-    hypotheses: int = 100
-    icp_iterations: int = 30
-    icp_points: int = 15_000
-    score: str = "votes"
-    fit_distance: float = 0.01
-    separation: float = 0.1
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "sampling": (0.02, 0.2),
-            "angles": (8, 90),
-            "reference_step": (1, 100),
-            "merge_distance": (0.0, 1.0),
-            "merge_degrees": (0.0, 180.0),
-            "hypotheses": (1, 10_000),
-            "icp_iterations": (0, 1000),
-            "icp_points": (100, 1_000_000),
-            "fit_distance": (0.001, 0.5),
-            "separation": (0.0, 1.0),
-        }
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"ppf {name} must lie in {low}..{high}, got {getattr(self, name)}")
-        if self.score not in SCORES:
-            near = difflib.get_close_matches(str(self.score), SCORES, n=1, cutoff=0.0)[0]
-            raise ValueError(
-                f"ppf score must be one of {', '.join(SCORES)}, got {self.score!r}, did you mean {near!r}?"
-            )
 
 
 class PpfDetector:

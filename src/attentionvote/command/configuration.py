@@ -6,7 +6,7 @@ with the nearest valid name, before any work starts:
 * a group choice that does not exist (``object=conecting_rod``) or a group that must be chosen;
 * a setting that does not exist (``trainer.max_epoch=3``, ``lr=1``);
 * a value of another type than the default it replaces (``trainer.lr=abc``);
-* a value outside its range (``schema.py``);
+* a value outside its range (on its field, see ``setting.py``);
 * an interpolation or a mandatory value that cannot be resolved.
 """
 
@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self, TypeVar
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -28,8 +29,8 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 from attentionvote.command.conf_folder import CONF, choices, groups
 from attentionvote.command.errors import ConfigurationError, nearest, sentence
-from attentionvote.command.schema import range_of, violation
 from attentionvote.command.words import parse
+from attentionvote.setting import SettingError, find, read, without_null
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -41,12 +42,44 @@ def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, node
 
 
-def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfig:
-    """The checked configuration of ``conf/<verb>.yaml`` with ``overrides``, every interpolation resolved.
+@dataclass(frozen=True)
+class VerbSettings:
+    """Settings of a verb: a subclass has a field for every key of ``conf/<verb>.yaml`` and the groups it chooses.
+
+    Attributes:
+        verb: stem of the configuration file.
+        composed: plain containers as Hydra composed them, every interpolation resolved: what identities are made of.
+    """
+
+    verb: ClassVar[str]
+    composed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> Self:
+        """Settings of plain containers.
+
+        Raises:
+            SettingError: on the first that is unknown, missing, of another type or out of its range.
+        """
+        settings = read(cls, plain)
+        object.__setattr__(settings, "composed", dict(plain))
+        return settings
+
+    def yaml(self) -> str:
+        """The settings as a configuration file."""
+        return str(OmegaConf.to_yaml(OmegaConf.create(self.composed)))
+
+
+Settings = TypeVar("Settings", bound=VerbSettings)
+
+
+def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CONF) -> Settings:
+    """The checked settings of a verb with ``overrides``, every interpolation resolved.
 
     Raises:
         ConfigurationError: with one sentence, see the module's docstring.
     """
+    verb = settings.verb
     parsed = parse(overrides)
     chosen = [o for o in parsed if o.input_line and (conf / o.key_or_group).is_dir()]
     for override in chosen:
@@ -56,18 +89,15 @@ def compose(verb: str, overrides: Sequence[str], conf: Path = CONF) -> DictConfi
         base = _defaults(verb, tuple(str(o.input_line) for o in parsed if o not in values), conf, _state(conf))
         for override in values:
             _check_key(override, base, conf)
-    cfg = _compose(verb, overrides, conf)
-    final = _plain(cfg)
+    final = _plain(_compose(verb, overrides, conf))
     for override in values:
         key = override.key_or_group
         if not (override.is_add() or override.is_delete()):
-            check_types(key, _select(base, key), _kept(final, override))
-    for key, value in leaves(final):
-        problem = violation(key, value)
-        if problem:
-            raise ConfigurationError(problem)
-    OmegaConf.resolve(cfg)
-    return cfg
+            check_types(settings, key, _select(base, key), _kept(final, override), base)
+    try:
+        return settings.of(final)
+    except SettingError as error:
+        raise ConfigurationError(sentence(error)) from error
 
 
 @lru_cache(maxsize=64)
@@ -167,19 +197,26 @@ def _kept(final: dict[str, Any], override: Override) -> Any:
         ) from None
 
 
-def check_types(key: str, default: Any, value: Any) -> None:
-    """Refuse ``value`` where it has another type than ``default``; null as a default accepts anything.
+def check_types(
+    settings: type[VerbSettings], key: str, default: Any, value: Any, values: Mapping[str, Any] | None = None
+) -> None:
+    """Refuse ``value`` where it has another type than ``default``, with the default as an example.
 
-    Null as a value is for settings that say their type in the table of ranges: these mean something without one.
+    Null is left to the setting's own type, on both sides.
+
+    Args:
+        values: of the settings, see ``setting.find``.
     """
-    if default is None or (value is None and range_of(key).kind is not None):
+    known = find(settings, key, values)
+    nullable = known is not None and without_null(known.type)[1]
+    if default is None or (value is None and nullable):
         return
     if isinstance(default, Mapping):
         if not isinstance(value, Mapping):
             raise ConfigurationError(f"{key} must be a section with keys {', '.join(map(str, default))}; got {value!r}")
         for name in value:
             if name in default:
-                check_types(f"{key}.{name}", default[name], value[name])
+                check_types(settings, f"{key}.{name}", default[name], value[name], values)
         return
     if isinstance(default, list):
         if not isinstance(value, list):
@@ -187,7 +224,7 @@ def check_types(key: str, default: Any, value: Any) -> None:
         if default and not value:
             raise ConfigurationError(f"{key} must not be empty, a list such as {default}; got []")
         for index, item in enumerate(value if default else ()):
-            check_types(f"{key}[{index}]", default[min(index, len(default) - 1)], item)
+            check_types(settings, f"{key}[{index}]", default[min(index, len(default) - 1)], item, values)
         return
     problem = type_problem(default, value)
     if problem:

@@ -1,9 +1,9 @@
 """What every verb has in common: help, configuration, errors, exit codes, the line on stdout.
 
-A verb is a script ``pipelines/<verb>.py`` with a function ``run(cfg) -> dict``::
+A verb is a script ``pipelines/<verb>.py`` with a function ``run(settings) -> dict``::
 
     if __name__ == "__main__":
-        command("train", run)
+        command(TrainSettings, run)
 
 The dictionary is printed as the only line on stdout, one JSON object; everything else that is
 printed while the verb runs, by anybody, goes to stderr. Exit codes: 0 success, 2 impossible
@@ -25,53 +25,58 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 
-from attentionvote.command.conf_folder import CONF, choices, primary_groups
-from attentionvote.command.configuration import compose, leaves
+from attentionvote.command.conf_folder import CONF
+from attentionvote.command.configuration import Settings, compose
 from attentionvote.command.errors import ConfigurationError, Refused, sentence
 from attentionvote.command.grid import run_grid
+from attentionvote.command.help import help_text
 from attentionvote.execution.job_process import join_starter, report_failure
 from attentionvote.files import FolderUnavailable
 
-Run = Callable[[DictConfig], dict[str, Any] | None]
+Run = Callable[[Settings], dict[str, Any] | None]
 Defaults = Callable[[list[str]], list[str]]
-Check = Callable[[DictConfig], object]
+Check = Callable[[Settings], object]
 LOGS = Path("outputs/logs")
 # Threads that wait for work sleep: spinning ones make a shared machine several times slower (torch reads this once).
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def command(
-    verb: str, run: Run, *, defaults: Defaults | None = None, check: Check | None = None, conf: Path = CONF
+    settings: type[Settings],
+    run: Run[Settings],
+    *,
+    defaults: Defaults | None = None,
+    check: Check[Settings] | None = None,
+    conf: Path = CONF,
 ) -> NoReturn:
     """Run a verb with the words of the command line and leave the process.
 
     Args:
-        verb: stem of the script and of its primary configuration file.
+        settings: of the verb; ``verb`` is the stem of the script and of its configuration file.
         run: does the work; its dictionary becomes the JSON line (None: another process of the same work prints it).
         defaults: given the user's words, further overrides that stand for the machine's default
             (they come first, so the user's words win).
         check: raises when a configuration cannot work, before the first job of a grid starts; ``run`` checks its own.
         conf: folder of the configuration files.
     """
-    words = sys.argv[1:]
+    verb, words = settings.verb, sys.argv[1:]
     join_starter()
     _log_to_stderr()
     if any(word in ("-h", "--help") for word in words):
-        print(_help(verb, conf))
+        print(help_text(settings, conf))
         sys.exit(0)
     with _one_sentence(verb):
         said = [word for word in words if not word.startswith("-")]
         flags = {word for word in words if word.startswith("-")}
         machine = defaults(said) if defaults is not None else []
         if not flags:
-            _print_result(run, compose(verb, [*machine, *words], conf))
+            _print_result(run, compose(settings, [*machine, *words], conf))
         elif flags <= {"-m", "--multirun"}:
-            run_grid(verb, said, machine, lambda job: compose(verb, job, conf), _configuring(check))
+            run_grid(verb, said, machine, lambda job: compose(settings, job, conf), _configuring(check))
         else:
-            _with_hydra(verb, run, words, machine, conf)
+            _with_hydra(settings, run, words, machine, conf)
     sys.exit(0)
 
 
@@ -89,11 +94,6 @@ def configuring(what: str = "") -> Iterator[None]:
         yield
     except (ConfigurationError, FolderUnavailable):
         raise
-    except InstantiationException as error:
-        cause = _root(error)
-        if isinstance(cause, (ValueError, TypeError, OSError, InstantiationException)):
-            raise ConfigurationError(_prefixed(what, cause)) from error
-        raise
     except (ValueError, TypeError, OSError) as error:
         raise ConfigurationError(_prefixed(what, error)) from error
 
@@ -102,13 +102,7 @@ def _prefixed(what: str, error: BaseException) -> str:
     return f"{what}: {sentence(error)}" if what else sentence(error)
 
 
-def _root(error: BaseException) -> BaseException:
-    while isinstance(error, InstantiationException) and error.__cause__ is not None:
-        error = error.__cause__
-    return error
-
-
-def _print_result(run: Run, cfg: DictConfig) -> None:
+def _print_result(run: Run[Settings], settings: Settings) -> None:
     """Run with file descriptor 1 pointing at stderr, so that the result is the only line on stdout."""
     sys.stdout.flush()
     stdout = os.dup(1)
@@ -116,7 +110,7 @@ def _print_result(run: Run, cfg: DictConfig) -> None:
     refusal, result = None, None
     try:
         try:
-            result = run(cfg)
+            result = run(settings)
         except Refused as error:
             refusal, result = error, error.result
         sys.stdout.flush()
@@ -135,26 +129,30 @@ def _jsonable(value: Any) -> Any:
     return str(value)
 
 
-def _configuring(check: Check | None) -> Check | None:
+def _configuring(check: Check[Settings] | None) -> Check[Settings] | None:
     """The check with its expected errors made configuration errors."""
     if check is None:
         return None
 
-    def checked(cfg: DictConfig) -> None:
-        with configuring(f"object {cfg.object.name}"):
-            check(cfg)
+    def checked(settings: Settings) -> None:
+        with configuring(f"object {settings.composed['object']['name']}"):
+            check(settings)
 
     return checked
 
 
-def _with_hydra(verb: str, run: Run, words: Sequence[str], machine: Sequence[str], conf: Path) -> None:
+def _with_hydra(
+    settings: type[Settings], run: Run[Settings], words: Sequence[str], machine: Sequence[str], conf: Path
+) -> None:
     """Hydra's own flags (``--cfg job``, ``--info`` ...), which show and run nothing."""
     import hydra
 
     def task(cfg: DictConfig) -> None:
-        with _one_sentence(verb):
-            OmegaConf.resolve(cfg)
-            _print_result(run, cfg)
+        with _one_sentence(settings.verb), configuring():
+            composed: Any = OmegaConf.to_container(cfg, resolve=True)
+            checked = settings.of(composed)
+        with _one_sentence(settings.verb):
+            _print_result(run, checked)
 
     own_defaults = {
         "hydra.run.dir": ".",
@@ -167,7 +165,7 @@ def _with_hydra(verb: str, run: Run, words: Sequence[str], machine: Sequence[str
     place = next((i for i, word in enumerate(words) if "=" in word), len(words))
     own = [*(f"{key}={value}" for key, value in own_defaults.items() if key not in given), *machine]
     sys.argv = [sys.argv[0], *words[:place], *own, *words[place:]]
-    hydra.main(config_path=str(conf), config_name=verb, version_base="1.3")(task)()
+    hydra.main(config_path=str(conf), config_name=settings.verb, version_base="1.3")(task)()
 
 
 @contextmanager
@@ -179,11 +177,6 @@ def _one_sentence(verb: str) -> Iterator[None]:
         _leave(f"{verb}: {sentence(error)}", 2)
     except Refused as error:
         _leave(f"{verb}: {sentence(error)}", 1)
-    except InstantiationException as error:
-        cause = _root(error)
-        if isinstance(cause, (ValueError, TypeError, OSError, InstantiationException)):
-            _leave(f"{verb}: {sentence(cause)}", 2)
-        _leave(f"{verb}: {type(cause).__name__}: {sentence(cause)}{_details(verb)}", 1)
     except KeyboardInterrupt:
         _leave(f"{verb}: interrupted; run the same command to resume", 130)
     except SystemExit as error:
@@ -230,22 +223,3 @@ def _log_to_stderr() -> None:
     for name in ("attentionvote", "__main__"):
         logging.getLogger(name).setLevel(logging.INFO)
     logging.captureWarnings(True)
-
-
-def _help(verb: str, conf: Path) -> str:
-    """The script's docstring, the groups with their choices, and every setting with its default."""
-    lines = [(sys.modules["__main__"].__doc__ or verb).strip(), ""]
-    primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
-    assert isinstance(primary, dict)
-    chosen = primary_groups(verb, conf)
-    lines += [f"  {name}=  {' | '.join(choices(name, conf))}" for name in chosen if (conf / name).is_dir()]
-    mandatory = [f"{g}={choices(g, conf)[0]}" for g, v in chosen.items() if v == "???" and choices(g, conf)]
-    try:
-        settings = leaves(OmegaConf.to_container(compose(verb, mandatory, conf)))
-    except ConfigurationError:  # e.g. a mandatory setting: show what the file itself holds
-        settings = leaves({key: value for key, value in primary.items() if key != "defaults"})
-    lines += ["", "Settings (key=value) and their defaults:"]
-    lines += [
-        f"  {key}={json.dumps(value, ensure_ascii=False)}" for key, value in settings if not key.startswith("hydra.")
-    ]
-    return "\n".join([*lines, "", "A comma-separated list of values with -m runs a grid (Hydra's multirun)."])

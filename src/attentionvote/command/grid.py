@@ -16,19 +16,22 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
+from attentionvote.command.configuration import Settings, VerbSettings
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.command.words import parse
 from attentionvote.execution.job_process import INTERRUPTED, JobProcess, Outcome
 
 log = logging.getLogger("attentionvote.multirun")
-Compose = Callable[[Sequence[str]], DictConfig]
-Check = Callable[[DictConfig], object]
+Compose = Callable[[Sequence[str]], Settings]
+Check = Callable[[Settings], object]
 SEVERAL = "grids"  # the experiment of a grid over several parts
 
 
-def run_grid(verb: str, words: Sequence[str], machine: Sequence[str], compose: Compose, check: Check | None) -> None:
+def run_grid(
+    verb: str, words: Sequence[str], machine: Sequence[str], compose: Compose[Settings], check: Check[Settings] | None
+) -> None:
     """Run all jobs of a grid, one after the other; a JSON object a job on stdout.
 
     Args:
@@ -89,30 +92,25 @@ def _run_job(job: Sequence[str], parent: Any) -> Outcome:
     return outcome
 
 
-def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurations: Sequence[DictConfig]) -> Any:
+def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurations: Sequence[VerbSettings]) -> Any:
     """The run above the jobs; None for a verb that tracks nothing."""
-    first = configurations[0]
-    if OmegaConf.select(first, "tracking.parent", default=0) == 0:
+    first = configurations[0].composed
+    tracking = first.get("tracking", {})
+    if "parent" not in tracking:
         return None
-    from attentionvote.command.identity import NOT_IDENTITY
+    from attentionvote.command.identity import without
     from attentionvote.tracking.group_run import open_group
 
-    contents = []
-    for configuration in configurations:
-        plain = OmegaConf.to_container(configuration, resolve=True)
-        assert isinstance(plain, dict)
-        for key in NOT_IDENTITY:  # how the jobs are run, not what they are
-            section, _, leaf = key.rpartition(".")
-            (plain.get(section, {}) if section else plain).pop(leaf, None)
-        contents.append(json.dumps(plain, sort_keys=True))
+    # How the jobs are run is not what they are.
+    contents = [json.dumps(without(configuration.composed), sort_keys=True) for configuration in configurations]
     digest = hashlib.sha256("\n".join([verb, *sorted(contents)]).encode()).hexdigest()
-    parts = {configuration.object.name for configuration in configurations}
+    parts = {configuration.composed["object"]["name"] for configuration in configurations}
     run = open_group(
-        first.tracking.store,
+        tracking["store"],
         parts.pop() if len(parts) == 1 else SEVERAL,
         f"{verb} {said}"[:250],
         digest,
-        parent=first.tracking.parent,
+        parent=tracking["parent"],
         tags={"grid.overrides": said, "grid.jobs": len(jobs)},
         config_yaml=OmegaConf.to_yaml(OmegaConf.create([list(job) for job in jobs])),
     )

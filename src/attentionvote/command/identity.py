@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
+
 # What may change between two calls that mean the same training: it does not change what is learned.
 NOT_IDENTITY = (
     *("resume", "force", "workers", "executor", "cluster", "tracking", "outputs", "root"),
     *("data.workers", "trainer.threads"),
 )
+
+
+def without(composed: Mapping[str, Any], keys: tuple[str, ...] = NOT_IDENTITY) -> dict[str, Any]:
+    """A copy of plain settings without these dotted keys; those that are not there are passed over."""
+    plain = deepcopy(dict(composed))
+    for key in keys:
+        section, _, leaf = key.rpartition(".")
+        (plain.get(section, {}) if section else plain).pop(leaf, None)
+    if "model" in plain:  # conf/model named its class before 0.2: a training keeps its identity
+        plain["model"]["_target_"] = "attentionvote.model.AttentionVote"
+    return plain

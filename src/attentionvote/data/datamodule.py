@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from attentionvote.data.augmentation import Augmentation
 from attentionvote.data.clouds import Clouds
-from attentionvote.data.samples import Augmentation, Batch, collate, draw_sample
-from attentionvote.model import Layout
+from attentionvote.data.samples import Batch, collate, draw_sample
+from attentionvote.model.neighborhoods import Layout
 
 
 class CloudSamples(Dataset[Batch]):

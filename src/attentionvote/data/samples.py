@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from attentionvote.data.augmentation import Augmentation
 from attentionvote.geometry.pointcloud import sample_indices
-from attentionvote.geometry.pose import rotation_about
-from attentionvote.model import Layout, Neighborhoods, find_neighborhoods
+from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_neighborhoods
 from attentionvote.scene import Scene
 
 
@@ -55,42 +53,6 @@ class Batch(NamedTuple):
             *(tuple(level[:count] for level in levels) for levels in self.found[1:]),
         )
         return Batch(**{name: getattr(self, name)[:count] for name in self._fields if name != "found"}, found=found)
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """Random motion of a training sample about its centroid.
-
-    Args:
-        roll: whether to turn it by any angle about the optical axis.
-        tilt: standard deviation in radians of a turn about a random axis in the image plane.
-        jitter_mm: standard deviation of extra point noise, added after the normals were estimated.
-    """
-
-    roll: bool = True
-    tilt: float = 0.15
-    jitter_mm: float = 0.0
-
-    def apply(
-        self,
-        points: NDArray[np.float32],
-        normals: NDArray[np.float32],
-        poses: NDArray[np.float64],
-        rng: np.random.Generator,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-        """Moved points ``(N, 3)``, normals ``(N, 3)`` and poses ``(I, 4, 4)``."""
-        turn = rotation_about([0, 0, 1], rng.uniform(0, 2 * np.pi) if self.roll else 0.0)
-        direction = rng.uniform(0, 2 * np.pi)
-        turn = rotation_about([np.cos(direction), np.sin(direction), 0], rng.normal(0, self.tilt)) @ turn
-        middle = points.mean(axis=0, dtype=np.float64)
-        turn32 = turn.T.astype(np.float32)
-        moved = (points - middle.astype(np.float32)) @ turn32 + middle.astype(np.float32)
-        if self.jitter_mm:
-            moved = moved + rng.normal(0, self.jitter_mm / 1000, moved.shape).astype(np.float32)
-        turned_poses = poses.copy()
-        turned_poses[:, :3, :3] = turn @ poses[:, :3, :3]
-        turned_poses[:, :3, 3] = (poses[:, :3, 3] - middle) @ turn.T + middle
-        return moved, normals @ turn32, turned_poses
 
 
 def draw_sample(

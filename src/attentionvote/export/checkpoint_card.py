@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard, PartCard
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.part import Parts
 
 _MOST_HEAT = 1.0  # of a farthest vote

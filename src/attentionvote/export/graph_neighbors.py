@@ -19,7 +19,7 @@ from attentionvote.export.graph_ball_query import ball_query
 from attentionvote.export.graph_blocks import in_blocks
 from attentionvote.export.graph_farthest_points import farthest_points
 from attentionvote.export.graph_operators import INT, constant, inner, operator, traced_operator, value
-from attentionvote.model import Layout, Neighborhoods
+from attentionvote.model.neighborhoods import Layout, Neighborhoods
 
 _SMALL, _LARGE, _MANY = 32, 64, 8192  # points a block, and of how many points on blocks are large: measured
 

@@ -16,11 +16,12 @@ from torch import Tensor, nn
 from attentionvote.export import graph_layers
 from attentionvote.export.graph_folding import GraphNorm, GraphVoteBranch, folded
 from attentionvote.export.graph_neighbors import find_neighborhoods
-from attentionvote.model import AttentionVote, Predictions
 from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.farthest_votes import FarthestVotes
 from attentionvote.model.fusion import VoteBranch
 from attentionvote.model.layers import RowNorm
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.predictions import Predictions
 from attentionvote.model.proposals import Heatmap
 from attentionvote.model.refinement import Refiner
 

@@ -15,7 +15,7 @@ from attentionvote.data.dataset_splits import DatasetSplits
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.datasets import UnknownLayout
-from attentionvote.model import Layout
+from attentionvote.model.neighborhoods import Layout
 from attentionvote.part import Parts
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_set import SceneSet

@@ -18,7 +18,8 @@ from attentionvote.contract import CARD_KEY, FOUND, INPUTS, LAYOUT_KEY, ModelCar
 from attentionvote.export.graph_neighbors import shapes_of
 from attentionvote.export.graph_network import ExportNetwork
 from attentionvote.export.graph_operators import OPSET, make_optional, write_out
-from attentionvote.model import AttentionVote, Predictions
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.predictions import Predictions
 
 
 def export_graph(model: AttentionVote, card: ModelCard) -> bytes:

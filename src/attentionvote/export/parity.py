@@ -17,7 +17,8 @@ from scipy.optimize import linear_sum_assignment
 from attentionvote.data.samples import Batch
 from attentionvote.evaluation import PoseMetric, SceneResult, evaluate, rotation_errors
 from attentionvote.export.parity_record import NAMES, Parity
-from attentionvote.model import AttentionVote, Predictions
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.predictions import Predictions
 from attentionvote.part import Parts
 from attentionvote.training.detections import scene_results
 

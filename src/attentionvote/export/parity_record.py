@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Annotated, Any
+
+from attentionvote.setting import Setting, check
 
 NAMES = ("ap_10", "ap_5", "ap_2")
 _COUNTS = ("scenes", "pairs", "unmatched", "worst_scene")
@@ -12,25 +14,24 @@ _COUNTS = ("scenes", "pairs", "unmatched", "worst_scene")
 
 @dataclass(frozen=True)
 class Limits:
-    """What may differ at most.
+    """What graph and checkpoint may differ at most.
 
-    Args:
-        translation_mm, rotation_degrees, confidence: largest difference of a matched pair.
-        translation_p99_mm, rotation_p99_degrees, confidence_p99: 99th percentile of all matched pairs.
-        unmatched: detections without a partner, both sides together.
-        ap: average precision at 10, 5 and 2 % of D.
-        scenes: least number of scenes for a proof.
+    Raises:
+        SettingError: when a limit is out of its range.
     """
 
-    translation_mm: float
-    translation_p99_mm: float
-    rotation_degrees: float
-    rotation_p99_degrees: float
-    confidence: float
-    confidence_p99: float
-    unmatched: int
-    ap: float
-    scenes: int
+    translation_mm: Annotated[float, Setting("Largest difference of a matched pair.", low=0, high=1000)]
+    translation_p99_mm: Annotated[float, Setting("99th percentile of all matched pairs.", low=0, high=1000)]
+    rotation_degrees: Annotated[float, Setting("Largest difference of a matched pair.", low=0, high=180)]
+    rotation_p99_degrees: Annotated[float, Setting("99th percentile of all matched pairs.", low=0, high=180)]
+    confidence: Annotated[float, Setting("Largest difference of a matched pair.", low=0, high=1)]
+    confidence_p99: Annotated[float, Setting("99th percentile of all matched pairs.", low=0, high=1)]
+    unmatched: Annotated[int, Setting("Detections without a partner, both sides together.", low=0, high=1_000_000)]
+    ap: Annotated[float, Setting("Average precision at 10, 5 and 2 % of D.", low=0, high=1)]
+    scenes: Annotated[int, Setting("Least number of scenes for a proof.", low=1, high=100_000)]
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True)

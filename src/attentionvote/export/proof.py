@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from attentionvote.contract import ModelCard
     from attentionvote.data.clouds import Clouds
     from attentionvote.export.parity_record import Limits, Parity
-    from attentionvote.model import AttentionVote
+    from attentionvote.model.network import AttentionVote
 
 log = logging.getLogger("attentionvote.export")
 EAGER = "torch eager, neighbours given"

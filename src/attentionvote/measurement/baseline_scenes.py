@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.baselines import Detections, PpfDetector, PpfSettings, check_opencv
+from attentionvote.baselines.opencv import check_opencv
+from attentionvote.baselines.ppf import Detections, PpfDetector
+from attentionvote.baselines.settings import PpfSettings
 from attentionvote.evaluation import SceneResult
 from attentionvote.execution import Executor, WorkerDied, run_all
 from attentionvote.geometry.pointcloud import estimate_normals

@@ -5,38 +5,56 @@ Plain numbers in, sentences out: nothing here measures, reads or writes. A gate 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from attentionvote.contract import ModelCard
-from attentionvote.evaluation import interval
-from attentionvote.evaluation.scene_result import Array
+from attentionvote.evaluation.bootstrap import interval
 from attentionvote.export.parity_record import Limits, Parity
+from attentionvote.setting import Setting, check
+
+if TYPE_CHECKING:
+    from attentionvote.evaluation.scene_result import Array
 
 PROVENANCE = ("commit", "data", "config", "versions", "signature")
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What a promotion demands.
+    """What a promotion demands; figures whose value is null are left out.
 
-    Args:
-        floors: least value by figure, whatever the champion reaches.
-        margins: by how much a figure may be lower than the champion's; a larger loss must be excluded with 97.5 %
-            confidence (the lower end of the 95 % interval of the paired difference).
-        latency_p95_ms: largest 95th percentile of an estimate on the machine that promotes.
-        scenes: least size of the evaluation set.
-        parity: what the proof of the export may have measured at most.
-        provenance: names of what must be known of a model's origin, of ``PROVENANCE``.
+    Raises:
+        SettingError: when a value is out of its range.
     """
 
-    floors: Mapping[str, float]
-    margins: Mapping[str, float]
-    latency_p95_ms: float
-    scenes: int
+    scenes: Annotated[int, Setting("Least size of the evaluation set.", low=1, high=1_000_000)]
+    floors: Annotated[
+        Mapping[str, float | None], Setting("Least values by figure, whatever the champion reaches.", low=0, high=1)
+    ]
+    margins: Annotated[
+        Mapping[str, float | None],
+        Setting(
+            "How much less than the champion's a figure may be: a larger loss must be excluded by the lower end of the "
+            "95 % interval of the paired difference.",
+            low=0,
+            high=1,
+        ),
+    ]
+    latency_p95_ms: Annotated[
+        float, Setting("Largest 95th percentile of an estimate on the machine that promotes.", above=0, high=600_000)
+    ]
     parity: Limits
-    provenance: Sequence[str] = PROVENANCE
+    provenance: Annotated[tuple[str, ...], Setting("What must be known of the model's origin.", choices=PROVENANCE)] = (
+        PROVENANCE
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def demanded(self, name: str) -> dict[str, float]:
+        """``floors`` or ``margins`` without the figures whose value is null."""
+        return {figure: value for figure, value in getattr(self, name).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -98,9 +116,9 @@ def judge(
         scenes: in the evaluation set.
     """
     gates = [Gate("scenes", scenes >= rules.scenes, f"at least {rules.scenes} scenes", f"measured on {scenes}")]
-    gates += _floors(rules.floors, candidate)
+    gates += _floors(rules.demanded("floors"), candidate)
     if champion is not None:
-        gates += _not_worse(rules.margins, candidate, champion)
+        gates += _not_worse(rules.demanded("margins"), candidate, champion)
     gates += [_latency(rules.latency_p95_ms, candidate), _parity(card, rules.parity)]
     return gates + [gate for gate in _provenance(card, origin) if gate.name in rules.provenance]
 

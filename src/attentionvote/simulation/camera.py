@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from attentionvote.geometry.pose import inverse, rotation_about, transform
+from attentionvote.setting import Setting, check
 
 # A PhoXi M above a bin of 143 mm parts; the distance scales with the bin, so every bin fills the picture.
 REFERENCE_DISTANCE = 0.80
@@ -18,17 +20,15 @@ REFERENCE_DIAMETER = 0.143
 class Camera:
     """Pinhole intrinsics in pixels; pixel ``(u, v)`` has its centre at ``(u, v)``, OpenCV convention."""
 
-    width: int = 1032
-    height: int = 772
-    fx: float = 1700.0
-    fy: float = 1700.0
-    cx: float = 516.0
-    cy: float = 386.0
+    width: Annotated[int, Setting("Pixels.", low=8, high=16384)] = 1032
+    height: Annotated[int, Setting("Pixels.", low=8, high=16384)] = 772
+    fx: Annotated[float, Setting("Focal length, pixels.", above=0, high=1e6)] = 1700.0
+    fy: Annotated[float, Setting("Focal length, pixels.", above=0, high=1e6)] = 1700.0
+    cx: Annotated[float, Setting("Principal point, pixels.", low=-1e6, high=1e6)] = 516.0
+    cy: Annotated[float, Setting("Principal point, pixels.", low=-1e6, high=1e6)] = 386.0
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "fx", "fy"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"camera {name} must be positive, got {getattr(self, name)}")
+        check(self)
 
     def rays(self, pixels: ArrayLike) -> NDArray[np.float64]:
         """Points ``(P, 2)`` of the plane z = 1 seen at pixels ``(P, 2)`` (u, v)."""
@@ -44,33 +44,23 @@ class Camera:
 class CameraSettings:
     """How the camera of a scene is drawn; every scene has its own, so that consecutive piles differ in the picture.
 
-    Args:
-        camera: intrinsics.
-        distance: metres to the bin's middle; None scales 0.80 m with the bin.
-        distance_jitter: relative, uniform in ``1 - jitter .. 1 + jitter``.
-        shift: sideways jitter per axis, as a share of the distance.
-        tilt_degrees: the camera swings around the bin by up to so much, in a random direction.
-        roll_degrees: rotation about the viewing axis, uniform in +- so much.
+    Raises:
+        SettingError: when a setting is out of its range.
     """
 
     camera: Camera = field(default_factory=Camera)
-    distance: float | None = None
-    distance_jitter: float = 0.08
-    shift: float = 0.015
-    tilt_degrees: float = 6.0
-    roll_degrees: float = 15.0
+    distance: Annotated[
+        float | None, Setting("Metres to the bin's middle; null = 0.80 m scaled with the bin.", above=0, high=100)
+    ] = None
+    distance_jitter: Annotated[
+        float, Setting("The distance varies by this share from scene to scene.", low=0, high=0.5)
+    ] = 0.08
+    shift: Annotated[float, Setting("Sideways jitter per axis, a share of the distance.", low=0, high=0.5)] = 0.015
+    tilt_degrees: Annotated[float, Setting("The camera swings around the bin by up to so much.", low=0, high=60)] = 6.0
+    roll_degrees: Annotated[float, Setting("Rotation about the viewing axis, +-.", low=0, high=180)] = 15.0
 
     def __post_init__(self) -> None:
-        if self.distance is not None and not self.distance > 0:
-            raise ValueError(f"camera distance must be positive metres, got {self.distance}")
-        for name, low, high in (
-            ("distance_jitter", 0, 0.5),
-            ("shift", 0, 0.5),
-            ("tilt_degrees", 0, 60),
-            ("roll_degrees", 0, 180),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"camera {name} must lie in {low}..{high}, got {getattr(self, name)}")
+        check(self)
 
     def sample(self, diameter: float, bin_height: float, rng: np.random.Generator) -> NDArray[np.float64]:
         """``camera_from_bin`` ``(4, 4)``: the camera looks down at a point a third up the bin's axis, with jitter.

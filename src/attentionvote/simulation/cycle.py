@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from attentionvote.part import Parts
 from attentionvote.simulation.decomposition import convex_hulls
-from attentionvote.simulation.drop import DropSettings, Solid, drop_parts
+from attentionvote.simulation.drop import Solid, drop_parts
+from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.raycast import BinSurface, PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 from attentionvote.simulation.scene_spec import SceneSetSpec

@@ -14,96 +14,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
-from attentionvote.part import Part, Parts
+from attentionvote.part import Part
 from attentionvote.simulation.decomposition import Hulls
 from attentionvote.simulation.mass import Mass, mass_properties
 
-# The bin of the IPA-like protocol, for slender parts of 143 mm.
-REFERENCE_DIAMETER = 0.143
-REFERENCE_BIN = (0.360, 0.280, 0.160)
-# Heaps of bulky parts reach the rim when the parts' convex hulls take about half of the bin's volume.
-_LARGEST_FILL = 0.45
 _SMALL_DIAMETER = 0.040  # below it, time step and contact time constant are halved
-
-
-@dataclass(frozen=True)
-class BinSettings:
-    """The bin.
-
-    Args:
-        size: inner length, width and height in metres; None scales 360 x 280 x 160 mm, see
-            :meth:`scaling_diameter`.
-        jitter: every side is multiplied by a factor uniform in ``1 - jitter .. 1 + jitter``, once per cycle.
-    """
-
-    size: tuple[float, float, float] | None = None
-    jitter: float = 0.15
-
-    def __post_init__(self) -> None:
-        if self.size is not None:
-            object.__setattr__(self, "size", tuple(float(s) for s in self.size))
-            if len(self.size) != 3 or min(self.size) <= 0:
-                raise ValueError(f"bin size must be three positive lengths in metres, got {list(self.size)}")
-        if not 0 <= self.jitter <= 0.5:
-            raise ValueError(f"bin jitter must lie in 0..0.5, got {self.jitter}")
-
-    def scaling_diameter(self, parts: Parts, count: int) -> float:
-        """The diameter in metres, relative to 143 mm, that bin and camera distance scale with.
-
-        It is D of the largest part, or more for bulky parts, of which ``count`` would not fit into a bin scaled with D;
-        with a given bin size, the diameter that belongs to its length.
-        """
-        if self.size is not None:
-            return self.size[0] / REFERENCE_BIN[0] * REFERENCE_DIAMETER
-        volume = np.mean([ConvexHull(part.vertices).volume for part in parts.parts])
-        fill = count * volume / np.prod(REFERENCE_BIN)
-        return max(parts.diameter, float(REFERENCE_DIAMETER * (fill / _LARGEST_FILL) ** (1 / 3)))
-
-    def sample(self, diameter: float, rng: np.random.Generator) -> NDArray[np.float64]:
-        """``(3,)`` inner size in metres for one cycle, ``diameter`` from :meth:`scaling_diameter`."""
-        size = np.array(self.size or np.array(REFERENCE_BIN) * diameter / REFERENCE_DIAMETER)
-        return size * rng.uniform(1 - self.jitter, 1 + self.jitter, size=3)
-
-
-@dataclass(frozen=True)
-class DropSettings:
-    """Physics of the drops.
-
-    Args:
-        timestep: seconds; 0.004 is the default, 0.008 with ``contact_time=0.02`` is "fast" (0.4 % D penetration).
-        contact_time: time constant of a contact in seconds (MuJoCo's ``solref[0]``).
-        friction: range of the sliding friction coefficient, drawn once per cycle.
-        hull_threshold: concavity threshold of the convex decomposition.
-        hull_vertices: most vertices of one convex piece.
-        speed: downward speed at release, m/s.
-        timeout: a drop that has not settled after so many seconds is judged as it is.
-    """
-
-    timestep: float = 0.004
-    contact_time: float = 0.01
-    friction: tuple[float, float] = (0.2, 0.6)
-    hull_threshold: float = 0.1
-    hull_vertices: int = 64
-    speed: float = 0.5
-    timeout: float = 1.5
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "friction", tuple(float(f) for f in self.friction))
-        if not 1e-4 <= self.timestep <= 0.01:
-            raise ValueError(f"drop timestep must lie in 0.0001..0.01 seconds, got {self.timestep}")
-        if self.contact_time < 2 * self.timestep:
-            raise ValueError(
-                f"drop contact_time must be at least two time steps ({2 * self.timestep:g} s), got {self.contact_time}"
-            )
-        if len(self.friction) != 2 or not 0 < self.friction[0] <= self.friction[1] <= 2:
-            raise ValueError(f"drop friction must be a range within 0..2, got {list(self.friction)}")
-        if not 0 <= self.speed <= 5:
-            raise ValueError(f"drop speed must lie in 0..5 m/s, got {self.speed}")
-        if not 0.25 < self.timeout <= 30:
-            raise ValueError(f"drop timeout must lie in 0.25..30 seconds, got {self.timeout}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part, PartSet
-from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
-from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
+from attentionvote.setting import Setting
 
 BUILTIN = "builtin:"
 
 
 def load_part(
-    name: str,
-    mesh: str,
-    diameter: float | None = None,
-    units: str = "m",
-    symmetry: Mapping[str, Any] | Symmetry | None = None,
-    title: str = "",
-    base_radius: float | None = None,
-    voxel_size: float | None = None,
+    name: Annotated[str, Setting("Stem of the configuration file.")],
+    mesh: Annotated[str, Setting("builtin:NAME of the catalogue, or the path of a mesh file in the part frame.")],
+    diameter: Annotated[float | None, Setting("D in metres; null = from the surface.", above=0, high=10)] = None,
+    units: Annotated[str, Setting("Unit of the file's numbers.", choices=("m", "cm", "mm", "inch"))] = "m",
+    symmetry: Annotated[Any, Setting("Proper symmetry in the part frame.")] = None,
+    title: Annotated[str, Setting("One line for people.")] = "",
+    base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
+    voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
 ) -> Part:
     """The part that ``conf/object/NAME.yaml`` describes.
 
@@ -43,6 +42,9 @@ def load_part(
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size), ("diameter", diameter)):
         if value is not None and not 0 < value < 10:
             raise ValueError(f"{name}: {key} must be positive metres (below 10) or null, got {value}")
+    from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
+    from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
+
     group = _symmetry(name, symmetry)
     if mesh.startswith(BUILTIN):
         key = mesh.removeprefix(BUILTIN)
@@ -62,11 +64,11 @@ def load_part(
 
 
 def load_parts(
-    name: str,
-    parts: Mapping[str, Part | Mapping[str, Any]],
-    title: str = "",
-    base_radius: float | None = None,
-    voxel_size: float | None = None,
+    name: Annotated[str, Setting("Stem of the configuration file.")],
+    parts: Annotated[Any, Setting("By name the settings of each part, in the order of the network's classes.")],
+    title: Annotated[str, Setting("One line for people.")] = "",
+    base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
+    voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
 ) -> PartSet:
     """The set of parts in one bin that ``conf/object/NAME.yaml`` describes.
 

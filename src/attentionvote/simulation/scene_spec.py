@@ -4,18 +4,35 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
 from attentionvote.part import Parts
-from attentionvote.simulation.camera import Camera, CameraSettings
-from attentionvote.simulation.drop import BinSettings, DropSettings
+from attentionvote.setting import Setting
+from attentionvote.simulation.camera import CameraSettings
+from attentionvote.simulation.drop_settings import BinSettings, DropSettings
 
 FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Piles of parts in a bin, by physics: sequential drops, every pile kept is a scene (``conf/simulation``)."""
+
+    seed: Annotated[int, Setting("Of all piles.", low=0, high=2**32 - 1)]
+    cycles: Annotated[
+        dict[str, int], Setting("Drop cycles per split; splits never share a cycle.", low=1, high=1_000_000)
+    ]
+    drop_counts: Annotated[tuple[int, ...], Setting("The pile is kept after these drops.", low=1, high=200)]
+    bin: BinSettings
+    camera: CameraSettings
+    drop: DropSettings
+    visibility_stride: Annotated[
+        int, Setting("Visibility is measured on every so-many-th pixel in both directions.", low=1, high=8)
+    ]
 
 
 @dataclass(frozen=True)
@@ -79,27 +96,20 @@ def scene_set_directory(root: Path, part_name: str, spec: SceneSetSpec) -> Path:
     return root / part_name / f"{spec.split}-{spec.digest()[:12]}"
 
 
-def scene_set_specs(part: Parts, settings: Mapping[str, Any]) -> dict[str, SceneSetSpec]:
-    """Specification of every split, from the plain values of ``conf/simulation/*.yaml``.
+def scene_set_specs(part: Parts, settings: SimulationSettings) -> dict[str, SceneSetSpec]:
+    """Specification of every split.
 
     Args:
         part: the part, or the set of parts in the bin.
-        settings: ``cycles`` (split name -> number of cycles), ``seed``, ``drop_counts``, ``visibility_stride`` and the
-            sections ``bin``, ``camera`` (with ``camera.camera``, the intrinsics) and ``drop``.
+        settings: of ``conf/simulation``.
 
     Raises:
-        ValueError: on an impossible or unknown setting.
+        ValueError: when a setting is impossible.
     """
-    try:
-        rest = dict(settings)
-        cycles = dict(rest.pop("cycles"))
-        camera = dict(rest.pop("camera"))
-        common = {
-            "bin": BinSettings(**rest.pop("bin")),
-            "camera": CameraSettings(**{**camera, "camera": Camera(**camera["camera"])}),
-            "drop": DropSettings(**rest.pop("drop")),
-            **rest,
-        }
-        return {split: SceneSetSpec(part.digest, split, count, **common) for split, count in cycles.items()}
-    except (TypeError, KeyError) as error:
-        raise ValueError(f"simulation settings must have the keys of conf/simulation/default.yaml: {error}") from error
+    s = settings
+    return {
+        split: SceneSetSpec(
+            part.digest, split, cycles, s.seed, s.drop_counts, s.bin, s.camera, s.drop, s.visibility_stride
+        )
+        for split, cycles in s.cycles.items()
+    }

@@ -5,16 +5,19 @@ Rays are cast at random pixels of the picture, so a cloud of 40,000 points costs
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.scene import Scene
+from attentionvote.setting import Setting, check
 from attentionvote.simulation.ray_selection import random_order
-from attentionvote.simulation.raycast import BinSurface, Floats, Hits, PartCaster
-from attentionvote.simulation.scene_record import SceneRecord
+
+if TYPE_CHECKING:
+    from attentionvote.simulation.raycast import BinSurface, Floats, Hits, PartCaster
+    from attentionvote.simulation.scene_record import SceneRecord
 
 PRESETS = ("none", "gaussian", "phoxi")
 # Lengths of the phoxi preset are for this working distance and scale with the scene's, as the vendor's sizes do.
@@ -25,57 +28,56 @@ _WORKING_DISTANCE = 0.80
 class Sensor:
     """A depth sensor.
 
-    Args:
-        preset: ``none`` (exact points: the paper's and IPA's data), ``gaussian`` (isotropic noise, a regulariser) or
-            ``phoxi`` (a structured-light scanner: everything below).
-        sigma_mm: ``gaussian``: standard deviation per axis; keep it under 2 % of D.
-        axial_sigma_mm: noise along the ray at 0.65 m and perpendicular incidence; grows with z^2 / cos(incidence).
-        grazing_degrees: incidence, at camera or projector, at which points begin to be lost and all are lost.
-        baseline: metres from camera to projector, left or right at random: what the projector does not see is lost.
-        edge_jump: metres of depth between neighbouring pixels that make an edge.
-        edge_dropout: share of edge points lost.
-        edge_flying: share of edge points that land between the two surfaces.
-        dropout: share of points lost anywhere.
-        specular: share of points lost whose normal lies within 5 degrees of mirror reflection into the camera.
-
     ``baseline`` and ``edge_jump`` hold at 0.80 m and scale with the working distance. The phoxi figures follow public
     data sheets of the Photoneo PhoXi M; they were not fitted to a real sensor.
 
     Raises:
-        ValueError: on an unknown preset or an impossible value.
+        SettingError: when a setting is out of its range.
+        ValueError: when two do not fit together.
     """
 
-    preset: str = "none"
-    sigma_mm: float = 0.3
-    axial_sigma_mm: float = 0.1
-    grazing_degrees: tuple[float, float] = (70.0, 85.0)
-    baseline: float = 0.27
-    edge_jump: float = 0.003
-    edge_dropout: float = 0.5
-    edge_flying: float = 0.1
-    dropout: float = 0.01
-    specular: float = 0.0
+    preset: Annotated[
+        str,
+        Setting(
+            "none (exact points: the paper's data), gaussian (isotropic noise) or phoxi (a structured-light scanner).",
+            choices=PRESETS,
+        ),
+    ] = "none"
+    sigma_mm: Annotated[
+        float, Setting("gaussian: standard deviation per axis; keep it under 2 % of D.", low=0, high=100)
+    ] = 0.3
+    axial_sigma_mm: Annotated[
+        float,
+        Setting("phoxi: noise along the ray at 0.65 m, grows with z^2 / cos(incidence).", low=0, high=100),
+    ] = 0.1
+    grazing_degrees: Annotated[
+        tuple[float, float],
+        Setting("phoxi: incidence at which points begin to be lost, and all are.", low=0, high=90),
+    ] = (70.0, 85.0)
+    baseline: Annotated[
+        float, Setting("phoxi: metres from camera to projector, whose shadows are lost.", low=0, high=100)
+    ] = 0.27
+    edge_jump: Annotated[
+        float, Setting("phoxi: metres of depth between neighbouring pixels that make an edge.", above=0, high=1)
+    ] = 0.003
+    edge_dropout: Annotated[float, Setting("phoxi: share of edge points lost.", low=0, high=1)] = 0.5
+    edge_flying: Annotated[
+        float, Setting("phoxi: share of edge points that land between the two surfaces.", low=0, high=1)
+    ] = 0.1
+    dropout: Annotated[float, Setting("phoxi: share of points lost anywhere.", low=0, high=1)] = 0.01
+    specular: Annotated[
+        float,
+        Setting("phoxi: share of points lost within 5 degrees of mirror reflection into the camera.", low=0, high=1),
+    ] = 0.0
 
     def __post_init__(self) -> None:
-        if self.preset not in PRESETS:
-            near = difflib.get_close_matches(str(self.preset), PRESETS, n=1, cutoff=0.0)[0]
-            raise ValueError(
-                f"sensor preset must be one of {', '.join(PRESETS)}, got {self.preset!r}, did you mean {near!r}?"
-            )
         object.__setattr__(self, "grazing_degrees", tuple(float(g) for g in self.grazing_degrees))
-        for name in ("sigma_mm", "axial_sigma_mm", "baseline"):
-            if not 0 <= getattr(self, name) < 100:
-                raise ValueError(f"sensor {name} must lie in 0..100, got {getattr(self, name)}")
-        if not self.edge_jump > 0:
-            raise ValueError(f"sensor edge_jump must be positive metres, got {self.edge_jump}")
-        for name in ("edge_dropout", "edge_flying", "dropout", "specular"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"sensor {name} must be a share in 0..1, got {getattr(self, name)}")
+        check(self)
         if self.edge_dropout + self.edge_flying > 1:
             raise ValueError(
                 f"sensor edge_dropout + edge_flying must be at most 1, got {self.edge_dropout + self.edge_flying:g}"
             )
-        if len(self.grazing_degrees) != 2 or not 0 <= self.grazing_degrees[0] < self.grazing_degrees[1] <= 90:
+        if self.grazing_degrees[0] >= self.grazing_degrees[1]:
             raise ValueError(f"sensor grazing_degrees must be a range within 0..90, got {list(self.grazing_degrees)}")
 
 

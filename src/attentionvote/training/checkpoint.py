@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 
 log = logging.getLogger(__name__)
 

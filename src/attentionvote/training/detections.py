@@ -8,7 +8,7 @@ from attentionvote.contract import is_detection
 from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult
 from attentionvote.geometry.pose import matrix_from_quaternion, transform
-from attentionvote.model import Predictions
+from attentionvote.model.predictions import Predictions
 
 
 def scene_results(

@@ -7,19 +7,19 @@ all processes add up to what one process would have computed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from attentionvote.data.samples import Batch
-from attentionvote.model import Peaks, Poses, Votes
+from attentionvote.model.predictions import Poses, Votes
+from attentionvote.model.proposals import Peaks
 from attentionvote.part import Parts
 from attentionvote.training.part_poses import PartPoses
-from attentionvote.training.pose_loss import RotationLoss
 from attentionvote.training.processes import summed
+from attentionvote.training.settings import LossSettings
 
 QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
 
@@ -36,40 +36,6 @@ class Assignment(NamedTuple):
     sample: Int[Tensor, " rows"]
     instance: Int[Tensor, " rows"]
     positive: Bool[Tensor, " rows"]
-
-
-@dataclass(frozen=True)
-class LossSettings:
-    """Choices of the loss; the terms' weights are a mapping beside it.
-
-    Args:
-        rotation: see ``pose_loss``.
-        isotropic: share of D added to Lambda in the ``metric`` rotation loss.
-        assignment: a proposal is positive when its centre seed lies within this share of an instance's D.
-        least_visible: instances with less visible fraction, and invisible ones, are never assigned.
-        confidence: ``exponential`` (Eq. 10) or ``quality``: expected share of the thresholds 2, 5 and 10 % D that
-            the pose meets, learned as a probability; proposals that match nothing, or whose class is another, count
-            as 0.
-        one_per_instance: whether all but the best of several proposals on one instance count as 0 in ``quality``; not
-            when the network merges them itself.
-        rows_per_scene: most proposals trained on, on average over the batch; an even choice of all.
-        detach_confidence: whether Eq. 10 leaves the pose's gradient alone (paper-decisions, row 33).
-    """
-
-    rotation: RotationLoss = "metric"
-    isotropic: float = 0.1
-    assignment: float = 0.2
-    least_visible: float = 0.05
-    confidence: Literal["exponential", "quality"] = "quality"
-    one_per_instance: bool = True
-    rows_per_scene: int = 64
-    detach_confidence: bool = True
-
-    def __post_init__(self) -> None:
-        if self.rotation not in get_args(RotationLoss):
-            raise ValueError(f"rotation loss must be one of {', '.join(get_args(RotationLoss))}, got {self.rotation!r}")
-        if self.confidence not in ("exponential", "quality"):
-            raise ValueError(f"confidence loss must be exponential or quality, got {self.confidence!r}")
 
 
 class AttentionVoteLoss:

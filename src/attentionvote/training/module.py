@@ -11,7 +11,8 @@ from torch import Tensor
 
 from attentionvote.data.samples import Batch
 from attentionvote.evaluation import SceneResult, evaluate
-from attentionvote.model import AttentionVote, Predictions
+from attentionvote.model.network import AttentionVote
+from attentionvote.model.predictions import Predictions
 from attentionvote.part import Parts
 from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY

@@ -10,7 +10,7 @@ of revolution all quaternion forms become the angle between the axes (Eq. 8).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -20,8 +20,8 @@ from torch import Tensor
 from attentionvote.geometry.pose import canonical_quaternion, quaternion_from_matrix
 from attentionvote.model.precision import full_precision
 from attentionvote.part import Part
+from attentionvote.training.settings import RotationLoss
 
-RotationLoss = Literal["metric", "slerp", "minra", "nlerp"]
 _TINY = 1e-6
 
 

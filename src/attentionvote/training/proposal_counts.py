@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.data.samples import Batch
-from attentionvote.model import Predictions
+from attentionvote.model.predictions import Predictions
 
 LEAST_VISIBLE = 0.5  # what must be found, as in the evaluation
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
+
+from attentionvote.setting import Setting, check
 
 Shape = Literal["step", "cosine", "constant"]
 
@@ -14,29 +16,34 @@ Shape = Literal["step", "cosine", "constant"]
 class Schedule:
     """How the learning rate and the instance losses' share change over the training.
 
-    Args:
-        shape: ``step`` (the paper's: times ``decay`` after each of ``milestones``), ``cosine`` (to zero at the end) or
-            ``constant``.
-        milestones: epochs after which ``step`` decays.
-        decay: factor of each decay.
-        rise_steps: steps over which the rate rises from zero to its full value at the start.
-        vote_steps: first steps in which only the voting loss acts (section 3.1: warm-up in terms of the loss).
-        ramp_steps: steps over which the instance losses then rise to their full weight.
-        vote_radius_factor: the voting radius is multiplied by it until the ramp ends (section 4.3: a bigger radius
-            benefits the warm-up).
+    Raises:
+        SettingError: when a setting is out of its range.
+        ValueError: when the milestones do not rise.
     """
 
-    shape: Shape = "step"
-    milestones: Sequence[int] = (5, 10)
-    decay: float = 0.1
-    rise_steps: int = 0
-    vote_steps: int = 0
-    ramp_steps: int = 1
-    vote_radius_factor: float = 1.0
+    shape: Annotated[
+        Shape,
+        Setting("step (the paper's: times decay after each of milestones), cosine (to zero at the end) or constant."),
+    ] = "step"
+    milestones: Annotated[tuple[int, ...], Setting("Epochs after which step decays.", low=1, high=1_000_000)] = (5, 10)
+    decay: Annotated[float, Setting("Factor of each decay.", above=0, high=1)] = 0.1
+    rise_steps: Annotated[
+        int, Setting("Steps over which the rate rises from zero at the start.", low=0, high=1_000_000_000)
+    ] = 0
+    vote_steps: Annotated[
+        int,
+        Setting("First steps with the voting loss alone (section 3.1: warm-up).", low=0, high=1_000_000_000),
+    ] = 0
+    ramp_steps: Annotated[
+        int, Setting("Steps over which the instance losses then rise to their weight.", low=0, high=1_000_000_000)
+    ] = 1
+    vote_radius_factor: Annotated[
+        float,
+        Setting("Of the voting radius until the ramp ends (section 4.3: helps the warm-up).", above=0, high=100),
+    ] = 1.0
 
     def __post_init__(self) -> None:
-        if self.shape not in get_args(Shape):
-            raise ValueError(f"schedule shape must be one of {', '.join(get_args(Shape))}, got {self.shape!r}")
+        check(self)
         if list(self.milestones) != sorted(set(self.milestones)):
             raise ValueError(f"milestones must be rising epochs, got {list(self.milestones)}")
 

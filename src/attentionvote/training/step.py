@@ -7,7 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from attentionvote.data.samples import Batch
-from attentionvote.model import AttentionVote
+from attentionvote.model.network import AttentionVote
 from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.processes import everyones, rank
 

@@ -6,13 +6,18 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig
+from typing import TYPE_CHECKING, Any
 
 from attentionvote.command.conf_folder import SCRIPTS
 from attentionvote.command.configuration import compose
 from attentionvote.execution.job_process import JobProcess
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
+from attentionvote.workflows.settings import ExportSettings
+from attentionvote.workflows.train.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from attentionvote.workflows.fleet.settings import FleetSettings
+    from attentionvote.workflows.tables.settings import TablesSettings
 
 VERBS = ("train", "export", "evaluate")
 
@@ -59,7 +64,7 @@ class MemberTask:
 
 
 def words_of_verbs(
-    cfg: DictConfig, training: Sequence[str], name: str
+    cfg: FleetSettings | TablesSettings, training: Sequence[str], name: str
 ) -> tuple[dict[str, tuple[str, ...]], dict[str, Path]]:
     """The words of every verb, and where bundles lie; all are composed once, so that a wrong one is said before work.
 
@@ -68,14 +73,14 @@ def words_of_verbs(
     beside = Path(cfg.outputs).parent
     said = {"export": list(cfg.export), "evaluate": list(cfg.evaluate)}
     export = [f"trained={cfg.outputs}", f"root={cfg.root}", f"outputs={beside / 'export'}", *said["export"]]
-    exported = compose("export", [f"object={name}", *export])
+    exported = compose(ExportSettings, [f"object={name}", *export])
     evaluate = [f"root={cfg.root}", f"bundles={exported.outputs}", f"outputs={beside / 'evaluate'}"]
     if cfg.tracking.store is not None:
         evaluate.append(f"tracking.store={cfg.tracking.store}")
     if exported.signing_keys is not None:
         evaluate.append(f"trusted_key={exported.signing_keys}/signing.pub")
     evaluate += said["evaluate"]
-    compose("evaluate", [f"object={name}", *evaluate])
-    compose("train", [f"object={name}", *training])
+    compose(EvaluateSettings, [f"object={name}", *evaluate])
+    compose(TrainSettings, [f"object={name}", *training])
     words = {"train": tuple(training), "export": tuple(export), "evaluate": tuple(evaluate)}
     return words, {"bundles": Path(exported.outputs)}

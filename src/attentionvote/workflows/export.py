@@ -8,13 +8,10 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 import attentionvote
 from attentionvote.execution.hardware import cores
@@ -30,6 +27,7 @@ from attentionvote.inference.bundles.signature import (
     make_keys,
 )
 from attentionvote.part import Parts
+from attentionvote.workflows.settings import ExportSettings
 from attentionvote.workflows.train.job import MODEL, RESULT
 
 if TYPE_CHECKING:
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from attentionvote.data.dataset_split import DatasetSplit
     from attentionvote.data.sensing import CloudSettings
     from attentionvote.export.parity_record import Limits
-    from attentionvote.model import AttentionVote
+    from attentionvote.model.network import AttentionVote
     from attentionvote.simulation.scene_set import SceneSet
 
 log = logging.getLogger("attentionvote.export")
@@ -50,20 +48,20 @@ log = logging.getLogger("attentionvote.export")
 class ExportJob:
     """One export: its settings, the part (or set of parts), the training it is of, the key that signs."""
 
-    cfg: DictConfig
+    cfg: ExportSettings
     part: Parts
     training: Path
     trained: dict[str, Any]
     key: Ed25519PrivateKey
 
     @classmethod
-    def find(cls, cfg: DictConfig) -> ExportJob:
+    def find(cls, cfg: ExportSettings) -> ExportJob:
         """The training that a configuration names, and the key, made when there is none.
 
         Raises:
             ValueError: when there is no such training, or more than one; or when the key cannot be had.
         """
-        part: Parts = instantiate(cfg.object)
+        part: Parts = cfg.object()
         if cfg.scenes < cfg.limits.scenes:
             raise ValueError(f"scenes must be at least limits.scenes ({cfg.limits.scenes}), got {cfg.scenes}")
         folder = Path(cfg.trained) / part.name
@@ -120,7 +118,6 @@ class ExportJob:
         """
         from attentionvote.export import held_out
         from attentionvote.export.checkpoint_card import model_card, used_otherwise
-        from attentionvote.export.parity_record import Limits
         from attentionvote.training.checkpoint import load_trained
 
         model, metadata = load_trained(self.training / MODEL)
@@ -138,7 +135,7 @@ class ExportJob:
             )
         run_id, commit = (str(self.trained.get(name) or "") for name in ("run_id", "commit"))
         card = model_card(model, metadata, self.part, *held_out.working_volume(clouds), run_id, commit)
-        return ExportWork(self, model, card, scenes, settings, clouds, indices, Limits(**self.cfg.limits))
+        return ExportWork(self, model, card, scenes, settings, clouds, indices, self.cfg.limits)
 
     def finish(self, bundle: Bundle, figures: dict[str, Any]) -> dict[str, Any]:
         """Record what was done; the dictionary of the JSON line."""
@@ -169,7 +166,7 @@ class ExportJob:
 
         code = hashlib.sha256()
         package = Path(attentionvote.__file__).parent
-        for path in sorted([*package.rglob("*.py"), *package.rglob("*.c"), *Path(__file__).parent.glob("export*.py")]):
+        for path in sorted([*package.rglob("*.py"), *package.rglob("*.c")]):
             code.update(path.read_bytes())
         weights = hashlib.sha256((self.training / MODEL).read_bytes()).hexdigest()
         content = {
@@ -179,7 +176,7 @@ class ExportJob:
             "code": code.hexdigest(),
             "versions": package_versions(),
             "signer": fingerprint(self.key.public_key()),
-            "settings": [self.cfg.scenes, self.cfg.golden, dict(self.cfg.limits)],
+            "settings": [self.cfg.scenes, self.cfg.golden, asdict(self.cfg.limits)],
             "used": [self.cfg.voting_radius, self.cfg.peak_threshold],
         }
         return self.folder / f"export-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]}.json"
@@ -218,7 +215,7 @@ class ExportWork:
         figures = {
             "parity": {path: p.as_dict() for path, p in parity.items()},
             "milliseconds": milliseconds,
-            "limits": dict(self.job.cfg.limits),
+            "limits": asdict(self.job.cfg.limits),
         }
         report = self.job.folder / f"parity-{self.job.training.name}.json"
         write_json(report, {"training": str(self.job.training), "scenes": self.indices, **figures})

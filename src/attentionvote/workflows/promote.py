@@ -9,10 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.errors import ConfigurationError, Refused
-from attentionvote.export.parity_record import Limits
 from attentionvote.inference import Bundle
 from attentionvote.measurement.models import Measurement
 from attentionvote.measurement.scenes import MeasuredScenes
@@ -22,6 +19,7 @@ from attentionvote.registry.promotion import Standing, Superseded, move, stand
 from attentionvote.registry.versions import DATA_FACT, Version, Versions
 from attentionvote.workflows.evaluate.job import EvaluationJob, trusted_key
 from attentionvote.workflows.evaluate.report import described, show
+from attentionvote.workflows.settings import PromoteSettings
 
 log = logging.getLogger("attentionvote.promote")
 
@@ -39,7 +37,7 @@ class PromotionJob:
     champion_key: str | None
 
     @classmethod
-    def find(cls, cfg: DictConfig) -> PromotionJob:
+    def find(cls, cfg: PromoteSettings) -> PromotionJob:
         """The candidate that a configuration names, and where the champion stands.
 
         Raises:
@@ -51,18 +49,12 @@ class PromotionJob:
                 "a promotion must measure models as cells run them, on evaluation.split=evaluation, got another split, "
                 "dataset or peak threshold: leave them out"
             )
-        gates = cfg.gates
-        floors = {name: value for name, value in gates.floors.items() if value is not None}
-        margins = {name: value for name, value in gates.margins.items() if value is not None}
-        rules = Rules(
-            floors, margins, gates.latency_p95_ms, gates.scenes, Limits(**gates.parity), list(gates.provenance)
-        )
         versions = Versions(cfg.tracking.store, evaluation.part.name)
         history = History(versions)
         standing = stand(versions, history)
         if standing.astray:
             log.warning("%s", standing.astray)
-        return cls(evaluation, rules, versions, history, standing, cfg.why, cfg.champion_key)
+        return cls(evaluation, cfg.gates, versions, history, standing, cfg.why, cfg.champion_key)
 
     def already(self) -> dict[str, Any] | None:
         """The answer when the candidate is the champion by a decision of ours; None otherwise."""

@@ -11,12 +11,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from attentionvote.command.entry import configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.execution.hardware import cores
 from attentionvote.files import read_json, write_json
+from attentionvote.workflows.settings import WriteDataSettings
 
 if TYPE_CHECKING:
     from attentionvote.datasets import PinholeCamera
@@ -29,9 +28,8 @@ log = logging.getLogger("attentionvote.write_data")
 IPA_SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: WriteDataSettings) -> dict[str, Any]:
     """Generate what is missing, write it; where it is and how much."""
-    from hydra.utils import instantiate
 
     from attentionvote.datasets.dataset import RECEIPT
     from attentionvote.part import only_part
@@ -41,12 +39,11 @@ def run(cfg: DictConfig) -> dict[str, Any]:
 
     start = time.monotonic()
     with configuring(f"object {cfg.object.name}"):
-        parts = instantiate(cfg.object)
+        parts = cfg.object()
         if cfg.format == "ipa":
             only_part(parts, "format=ipa")
     with configuring():
-        simulation: Any = OmegaConf.to_container(cfg.simulation)
-        specs = scene_set_specs(parts, simulation)
+        specs = scene_set_specs(parts, cfg.simulation)
         if cfg.split not in specs:
             raise ConfigurationError(f"split must be one of {', '.join(specs)}; got {cfg.split!r}")
         spec = specs[cfg.split]

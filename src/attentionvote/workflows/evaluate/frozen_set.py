@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from omegaconf import DictConfig, OmegaConf
+from typing import TYPE_CHECKING
 
 from attentionvote.execution.hardware import cores
 from attentionvote.part import Parts, only_part
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
-from attentionvote.simulation.sensor import Sensor
+from attentionvote.workflows.evaluate.settings import MeasuredBundle
 
 if TYPE_CHECKING:
     from attentionvote.measurement.scenes import EvaluationSet, MeasuredScenes
@@ -19,18 +18,17 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.evaluate")
 
 
-def set_spec(cfg: DictConfig, part: Parts, split: str | None = None, cycles: int | None = None) -> SceneSetSpec:
+def set_spec(cfg: MeasuredBundle, part: Parts, split: str | None = None, cycles: int | None = None) -> SceneSetSpec:
     """What determines the frozen set; or cycles of another split of the same simulation.
 
     Raises:
         ValueError: when a setting is impossible.
     """
-    settings: Any = OmegaConf.to_container(cfg.simulation, resolve=True)
     split = split or cfg.evaluation.split
-    return scene_set_specs(part, settings | {"cycles": {split: cycles or cfg.evaluation.cycles}})[split]
+    return scene_set_specs(part, replace(cfg.simulation, cycles={split: cycles or cfg.evaluation.cycles}))[split]
 
 
-def scenes_of(cfg: DictConfig, part: Parts) -> MeasuredScenes:
+def scenes_of(cfg: MeasuredBundle, part: Parts) -> MeasuredScenes:
     """The scenes of a dataset when one is named, otherwise the frozen set, generated when it is not there yet.
 
     Raises:
@@ -44,7 +42,7 @@ def scenes_of(cfg: DictConfig, part: Parts) -> MeasuredScenes:
     return DatasetScenes.find(Path(chosen.dataset), only_part(part, "a dataset's scenes"), chosen.density)
 
 
-def generated_set(cfg: DictConfig, part: Parts, spec: SceneSetSpec) -> EvaluationSet:
+def generated_set(cfg: MeasuredBundle, part: Parts, spec: SceneSetSpec) -> EvaluationSet:
     """Generated scenes and the sensor that sees them.
 
     A frozen set whose digest is recorded in ``evaluation.frozen`` and is another one here is used, and said: physics
@@ -57,7 +55,7 @@ def generated_set(cfg: DictConfig, part: Parts, spec: SceneSetSpec) -> Evaluatio
     directory = scene_set_directory(Path(cfg.root) / "scenes", part.name, spec)
     scenes = generate_scene_set(part, spec, directory, cfg.workers or cores())
     chosen = cfg.evaluation
-    settings = CloudSettings(Sensor(**chosen.sensor), density=chosen.density, pool=chosen.density)
+    settings = CloudSettings(chosen.sensor, density=chosen.density, pool=chosen.density)
     made = EvaluationSet(scenes, part, settings, spec.split)
     log.info("%s: %s set %s, %d scenes", part.name, spec.split, made.digest[:12], len(made))
     if is_recorded(cfg, part, made) is False:
@@ -68,7 +66,7 @@ def generated_set(cfg: DictConfig, part: Parts, spec: SceneSetSpec) -> Evaluatio
     return made
 
 
-def is_recorded(cfg: DictConfig, part: Parts, scenes: MeasuredScenes) -> bool | None:
+def is_recorded(cfg: MeasuredBundle, part: Parts, scenes: MeasuredScenes) -> bool | None:
     """Whether scenes are those whose digest is recorded; None when none is, or they are of another kind."""
     from attentionvote.measurement.scenes import EvaluationSet
 

@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hydra.utils import instantiate
-from omegaconf import DictConfig
-
 from attentionvote.inference import Bundle, load_bundle
 from attentionvote.inference.bundles.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
 from attentionvote.part import Parts
-from attentionvote.simulation.sensor import Sensor
 from attentionvote.workflows.evaluate.frozen_set import scenes_of, set_spec
+from attentionvote.workflows.evaluate.settings import MeasuredBundle
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -31,21 +28,20 @@ log = logging.getLogger("attentionvote.evaluate")
 class EvaluationJob:
     """One bundle to be measured: its part, and the key that signed it."""
 
-    cfg: DictConfig
+    cfg: MeasuredBundle
     part: Parts
     bundle: Bundle
     key: Ed25519PublicKey
 
     @classmethod
-    def find(cls, cfg: DictConfig) -> EvaluationJob:
+    def find(cls, cfg: MeasuredBundle) -> EvaluationJob:
         """The bundle that a configuration names, verified, and the set it is measured on.
 
         Raises:
             ValueError: when there is no such bundle, it cannot be trusted, or a setting is impossible.
         """
-        part: Parts = instantiate(cfg.object)
+        part: Parts = cfg.object()
         set_spec(cfg, part)
-        Sensor(**cfg.evaluation.sensor)
         key = trusted_key(cfg.trusted_key)
         bundle = load_bundle(_folder(Path(cfg.bundles) / part.name, cfg.bundle, part.name), key)
         if bundle.card.part.digest != part.digest:

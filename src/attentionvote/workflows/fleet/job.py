@@ -8,8 +8,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.conf_folder import choices
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import configuring
@@ -17,7 +15,9 @@ from attentionvote.command.errors import ConfigurationError, Refused, nearest, s
 from attentionvote.command.words import parse, words_beside
 from attentionvote.part import only_part
 from attentionvote.workflows.chain import words_of_verbs
+from attentionvote.workflows.fleet.settings import FleetSettings
 from attentionvote.workflows.train.preset import preset_of_workers
+from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from attentionvote.execution import Executor
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.fleet")
 
 
-def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
+def run(cfg: FleetSettings, words: Sequence[str]) -> dict[str, Any]:
     """Bring every part to its evaluation; the leaderboard.
 
     Args:
@@ -48,7 +48,7 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     for name, reason in left_out.items():
         log.warning("%s is left out: %s", name, reason)
     workers = cfg.workers or 1
-    threads = cores_of_a_job(cfg, workers)
+    threads = cores_of_a_job(cfg.threads, cfg.executor, workers)
     folder = Path(cfg.fleets)
     here = cfg.executor == "local" and workers == 1
     own = () if here else (f"workers={threads}", f"trainer.threads={threads}")
@@ -109,7 +109,7 @@ def members(objects: str, training: Sequence[str]) -> tuple[dict[str, TrainingJo
     jobs: dict[str, TrainingJob] = {}
     left_out: dict[str, str] = {}
     for name in dict.fromkeys(named):
-        cfg = compose("train", [f"object={name}", *training])
+        cfg = compose(TrainSettings, [f"object={name}", *training])
         try:
             with configuring():
                 job = find_training(cfg)

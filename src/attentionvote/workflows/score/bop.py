@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from attentionvote.evaluation.bop_files import (
     BopPoses,
@@ -23,17 +22,19 @@ from attentionvote.evaluation.bop_files import (
 from attentionvote.evaluation.bop_scores import LENGTHS_MM, RESULT_LIMIT, RESULT_LIMITS, SHARES, bop_scores, selected
 from attentionvote.inference.scans.limits import Budget
 from attentionvote.inference.scans.ply_file import points_from_ply
+from attentionvote.workflows.settings import ScoreSettings
 
 log = logging.getLogger("attentionvote.score")
 MOST_VERTEX_BYTES = 1024 * 1024 * 1024
 
 
-def scored(cfg: DictConfig) -> dict[str, Any]:
+def scored(cfg: ScoreSettings) -> dict[str, Any]:
     """Figures over all objects, and of every object alone (docs/scoring.md says what each means).
 
     Raises:
         ValueError: with one sentence, when a file is missing or wrong.
     """
+    assert cfg.models is not None
     name = parse_name(cfg.results)
     models = read_models_info(Path(cfg.models) / "models_info.json")
     truth, images = read_truth(cfg.gt, cfg.suffix)

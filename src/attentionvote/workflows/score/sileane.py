@@ -5,28 +5,29 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from attentionvote.evaluation import DetectionScores, read_metric, read_scene_results
 from attentionvote.evaluation.average_precision import score_tables, summarize
 from attentionvote.evaluation.scene_result import distance_tables
+from attentionvote.workflows.settings import ScoreSettings
 
 CURVE_STEPS = 20
 
 
-def scored(cfg: DictConfig) -> dict[str, Any]:
+def scored(cfg: ScoreSettings) -> dict[str, Any]:
     """Figures over all scenes, and of every scene alone (docs/scoring.md says what each means).
 
     Raises:
         ValueError: with one sentence, when a file is missing or wrong.
     """
+    assert cfg.poseutils is not None
     metric, full = read_metric(cfg.poseutils, cfg.frame)
     threshold = cfg.threshold_scale * full
     named = read_scene_results(cfg.gt, cfg.results)
     scenes = list(named.values())
     tables = distance_tables(scenes, metric)
     scores = score_tables(scenes, tables, threshold, cfg.occlusion, cfg.result_limit)
-    result = {
+    result: dict[str, Any] = {
         "format": "sileane",
         "frame": cfg.frame,
         "occlusion": cfg.occlusion,

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from attentionvote.data.samples import Augmentation, Batch, draw_sample
+from attentionvote.data.samples import Batch, draw_sample
 from attentionvote.data.sensing import measure
 from attentionvote.geometry import native
 from attentionvote.geometry.pose import apply, inverse
@@ -46,7 +46,7 @@ def new_sample(material: Material, size: str) -> Contest:
     cfg, layout = material.trainings[size], material.network(size).layout
     settings = material.cloud_settings(size)
     settings = replace(settings, pool=min(cfg.data.points, settings.density))
-    record, caster, motion = material.record, material.caster, Augmentation(**cfg.data.augmentation)
+    record, caster, motion = material.record, material.caster, cfg.data.augmentation
 
     def fast() -> list[Any]:
         scene = measure(record, caster, settings)
@@ -72,7 +72,7 @@ def cached_sample(material: Material, size: str) -> Contest:
         material.stored(size),
         cfg.data.points,
         material.network(size).layout,
-        Augmentation(**cfg.data.augmentation),
+        cfg.data.augmentation,
         material.seed,
     )
 

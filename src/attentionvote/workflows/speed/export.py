@@ -15,7 +15,7 @@ from attentionvote.inference.bundles.bundle import Bundle
 from attentionvote.inference.measured_points import measured_points
 from attentionvote.inference.preparation import find_neighbors, prepare
 from attentionvote.inference.runtime import Session
-from attentionvote.model import Predictions
+from attentionvote.model.predictions import Predictions
 from attentionvote.workflows.speed.contest import Contest, Unequal
 from attentionvote.workflows.speed.data import slowly
 from attentionvote.workflows.speed.material import Material

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import torch
 
-from attentionvote.model import Predictions
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.model.predictions import Predictions
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.step import batch_loss
 from attentionvote.workflows.speed.contest import Contest, NotMeasured, Unequal
 from attentionvote.workflows.speed.material import Material
@@ -28,7 +29,7 @@ def training(material: Material, device: str = "cuda") -> Contest:
     scenes = SCENES if device == "cuda" else 2
     whole = type(one)(*(_repeated(value, scenes) for value in one))
     model = copy.deepcopy(material.network("full")).to(device).train()
-    loss = AttentionVoteLoss(material.part, cfg.loss.weights, LossSettings(**cfg.loss.settings))
+    loss = AttentionVoteLoss(material.part, asdict(cfg.loss.weights), cfg.loss.settings)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0, foreach=True)
 
     def fast() -> float:

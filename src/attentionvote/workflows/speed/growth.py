@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from attentionvote.data.samples import Augmentation, draw_sample
+from attentionvote.data.augmentation import Augmentation
+from attentionvote.data.samples import draw_sample
 from attentionvote.data.sensing import measure
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.workflows.speed.contest import Contest, Goal, Unequal

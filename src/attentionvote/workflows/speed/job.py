@@ -9,13 +9,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import configuring
 from attentionvote.command.errors import Refused, sentence
 from attentionvote.workflows.speed.contest import NotMeasured, Row, Unequal, measure
 from attentionvote.workflows.speed.rows import ROWS, chosen
+from attentionvote.workflows.speed.settings import SpeedSettings
+from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from attentionvote.workflows.speed.material import Material
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.bench")
 
 
-def run(cfg: DictConfig) -> dict[str, Any]:
+def run(cfg: SpeedSettings) -> dict[str, Any]:
     """Measure the chosen rows, show them, and write them down."""
     from attentionvote.workflows.page_sections import put
     from attentionvote.workflows.speed.report import COMMAND, SECTION, keep, kept_rows, markdown, run_facts, show
@@ -99,12 +99,11 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _material(cfg: DictConfig) -> Material:
+def _material(cfg: SpeedSettings) -> Material:
     """What the rows work on; the configurations of the two trainings are checked with it."""
-    from hydra.utils import instantiate
 
     from attentionvote.workflows.speed.material import Material
 
     words = [f"object={cfg.object.name}", f"seed={cfg.seed}"]
-    trainings = {size: compose("train", [*words, *cfg[size]]) for size in ("compact", "full")}
-    return Material(instantiate(cfg.object), trainings, dict(cfg.batch), cfg.seed)
+    trainings = {size: compose(TrainSettings, [*words, *getattr(cfg, size)]) for size in ("compact", "full")}
+    return Material(cfg.object(), trainings, dict(cfg.batch), cfg.seed)

@@ -8,12 +8,10 @@ from dataclasses import asdict, replace
 from functools import cache, cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from hydra.utils import instantiate
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.data.clouds import Clouds, measure_clouds
 from attentionvote.data.sensing import CloudSettings, measure, sense
@@ -23,13 +21,13 @@ from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 from attentionvote.simulation.scene_set import generate_scene_set
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
-from attentionvote.simulation.sensor import Sensor
 from attentionvote.workflows.train.network import described, network_arguments
+from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from attentionvote.contract import ModelCard
     from attentionvote.data.samples import Batch
-    from attentionvote.model import AttentionVote
+    from attentionvote.model.network import AttentionVote
 
 WORKING_POINT = 0.0  # of networks with random weights: every pose is an answer
 
@@ -47,7 +45,9 @@ class Material:
         seed: of everything random.
     """
 
-    def __init__(self, part: Parts, trainings: Mapping[str, DictConfig], batch: Mapping[str, int], seed: int) -> None:
+    def __init__(
+        self, part: Parts, trainings: Mapping[str, TrainSettings], batch: Mapping[str, int], seed: int
+    ) -> None:
         self.part, self.trainings, self.batch_size, self.seed = part, trainings, batch, seed
         self._folder = tempfile.TemporaryDirectory(prefix="attentionvote-bench-")
         self.folder = Path(self._folder.name)
@@ -74,8 +74,7 @@ class Material:
     @cached_property
     def cycle(self) -> SceneSetSpec:
         """The training scenes of the full size, one cycle."""
-        settings: Any = OmegaConf.to_container(self.trainings["full"].simulation, resolve=True)
-        return replace(scene_set_specs(self.part, settings)["train"], cycles=1, seed=self.seed)
+        return replace(scene_set_specs(self.part, self.trainings["full"].simulation)["train"], cycles=1, seed=self.seed)
 
     @cached_property
     def records(self) -> list[SceneRecord]:
@@ -101,7 +100,7 @@ class Material:
     def cloud_settings(self, size: str) -> CloudSettings:
         """What the sensor measures."""
         data = self.trainings[size].data
-        return CloudSettings(Sensor(**data.sensor), data.density, data.pool, data.normal_neighbors)
+        return CloudSettings(data.sensor, data.density, data.pool, data.normal_neighbors)
 
     def sensed(self, points: int) -> NDArray[np.float32]:
         """``(points,)`` points of the pile as the sensor delivers them, repeated where the picture has no more."""
@@ -126,16 +125,18 @@ class Material:
         """The network of a size in evaluation."""
         import torch
 
+        from attentionvote.model.network import AttentionVote
+
         torch.manual_seed(self.seed)
-        model: AttentionVote = instantiate(network_arguments(self.trainings[size].model, self.part), _convert_="all")
+        model: AttentionVote = AttentionVote(**network_arguments(self.trainings[size].model, self.part))
         return model.eval()
 
     def batch(self, size: str, scenes: int | None = None) -> Batch:
         """Samples of the pile, each turned its own way."""
-        from attentionvote.data.samples import Augmentation, collate, draw_sample
+        from attentionvote.data.samples import collate, draw_sample
 
         cfg, rng = self.trainings[size], self.rng()
-        layout, motion = self.network(size).layout, Augmentation(**cfg.data.augmentation)
+        layout, motion = self.network(size).layout, cfg.data.augmentation
         count = scenes or self.batch_size[size]
         return collate([draw_sample(self.scene(size), cfg.data.points, layout, motion, rng) for _ in range(count)])
 

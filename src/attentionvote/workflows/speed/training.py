@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.point_features import CHANNELS, pair_features_reference
 from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_reference
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.step import batch_loss
 from attentionvote.workflows.speed.contest import Contest, Unequal
 from attentionvote.workflows.speed.data import slowly
@@ -103,7 +104,7 @@ def set_abstraction(material: Material) -> Contest:
 def step(material: Material, size: str) -> Contest:
     """Losses, gradients, clipping, optimiser; neighbours come with the batch, as loader processes send them."""
     cfg, batch = material.trainings[size], material.batch(size)
-    loss = AttentionVoteLoss(material.part, cfg.loss.weights, LossSettings(**cfg.loss.settings))
+    loss = AttentionVoteLoss(material.part, asdict(cfg.loss.weights), cfg.loss.settings)
 
     def contestant() -> Callable[[], Answer]:
         model = copy.deepcopy(material.network(size)).train()

@@ -9,7 +9,6 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
 from attentionvote.command.configuration import compose
@@ -21,10 +20,12 @@ from attentionvote.workflows.sweep.driver import TRAIN, SweepDriver
 from attentionvote.workflows.sweep.ending import report
 from attentionvote.workflows.sweep.progress import SweepProgress
 from attentionvote.workflows.sweep.report import experiment_text, run_of, write_table
+from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.sweep.space import parse_space
 from attentionvote.workflows.sweep.study import Ledger, make_pruner, open_study, study_name
 from attentionvote.workflows.sweep.trial_place import for_trial, log_of, on_worker
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 
 TRIAL_JOB = Path(__file__).with_name("trial_elsewhere.py")
 log = logging.getLogger("attentionvote.sweep")
@@ -42,9 +43,9 @@ class SweepJob:
         ConfigurationError: with one sentence, when space, training or sweep cannot work.
     """
 
-    def __init__(self, cfg: DictConfig, base: Sequence[str], space: str) -> None:
+    def __init__(self, cfg: SweepSettings, base: Sequence[str], space: str) -> None:
         self.cfg, self.base = cfg, list(base)
-        training = compose("train", self.base)
+        training = compose(TrainSettings, self.base)
         self.training = training
         self.part: str = training.object.name
         found = find_training(training)
@@ -54,8 +55,7 @@ class SweepJob:
                 f"trainer.max_epochs must be at least trainer.validate_every ({t.validate_every}), or no trial has a "
                 f"val/ap; got {t.max_epochs}"
             )
-        how = OmegaConf.to_container(cfg.sweep, resolve=True)
-        assert isinstance(how, dict)
+        how = cfg.composed["sweep"]
         self.space = parse_space(how["space"], training)
         experiment_text(self.base, {}, "")  # what cannot be written as an experiment is said now
         self.pruner = {**how["pruner"], "validate_every": t.validate_every, "max_epochs": t.max_epochs}
@@ -63,7 +63,7 @@ class SweepJob:
         self.folder = Path(cfg.sweeps) / self.part / self.name
         self.url = cfg.storage or f"sqlite:///{(self.folder / 'study.db').absolute()}"
         self.workers = cfg.workers or 1
-        self.threads = cores_of_a_job(cfg, self.workers)
+        self.threads = cores_of_a_job(cfg.threads, cfg.executor, self.workers)
         self.executor = executor_of(cfg)
         self.cluster = cluster_of(cfg)
         self.gpus = visible_gpus(os.environ) if cfg.executor == "local" and self.workers > 1 else []
@@ -108,7 +108,7 @@ class SweepJob:
             self.training.tracking.store, self.part, f"sweep {self.name}", self.name,
             params={"study": self.name, **{f"space.{s.name}": ", ".join(map(str, s.extremes)) for s in self.space}},
             tags={"sweep.study": self.name, "sweep.trials": total},
-            config_yaml=OmegaConf.to_yaml(self.cfg, resolve=True), parent=self.cfg.tracking.parent,
+            config_yaml=self.cfg.yaml(), parent=self.cfg.tracking.parent,
         ) as parent:  # fmt: skip
             self.parent = parent
             with SweepProgress(max(total, done + lost), done, self.workers, self.space) as progress:
@@ -134,7 +134,7 @@ class SweepJob:
 
     def directory(self, values: Mapping[str, Any]) -> Path:
         """The folder of a trial's training."""
-        return find_training(compose("train", self._chosen(values))).directory
+        return find_training(compose(TrainSettings, self._chosen(values))).directory
 
     def _chosen(self, values: Mapping[str, Any]) -> list[str]:
         return [*self.base, *(setting.word(values[setting.name]) for setting in self.space)]

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from typing import TYPE_CHECKING, Any
-
-from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.command.configuration import check_types, leaves, type_problem
 from attentionvote.command.errors import ConfigurationError, nearest
 from attentionvote.command.identity import NOT_IDENTITY
-from attentionvote.command.schema import violation
+from attentionvote.setting import SettingError, check_value
 from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
@@ -65,7 +67,7 @@ def _label(choice: Any) -> Any:
     return choice if choice is None or isinstance(choice, (bool, int, float, str)) else json.dumps(choice)
 
 
-def parse_space(entries: Sequence[Mapping[str, Any]], base: DictConfig) -> list[Setting]:
+def parse_space(entries: Sequence[Mapping[str, Any]], base: TrainSettings) -> list[Setting]:
     """The settings of a space.
 
     Args:
@@ -75,8 +77,7 @@ def parse_space(entries: Sequence[Mapping[str, Any]], base: DictConfig) -> list[
     Raises:
         ConfigurationError: with one sentence, when an entry is unknown, impossible or out of range.
     """
-    plain = OmegaConf.to_container(base, resolve=True)
-    known = dict(leaves(plain))
+    known = dict(leaves(base.composed))
     if not entries:
         raise ConfigurationError("sweep.space must have at least one setting, got none")
     settings = [_setting(entry, known) for entry in entries]
@@ -112,12 +113,10 @@ def _setting(entry: Any, known: Mapping[str, Any]) -> Setting:
     values = _choices(entry, where) if kind == "categorical" else _bounds(entry, where, kind)
     for value in values:
         try:
-            check_types(name, known[name], value)
-        except ConfigurationError as error:
+            check_types(TrainSettings, name, known[name], value)
+            check_value(TrainSettings, name, value)
+        except (ConfigurationError, SettingError) as error:
             raise ConfigurationError(f"sweep.space: {error}") from None
-        problem = violation(name, value)
-        if problem:
-            raise ConfigurationError(f"sweep.space: {problem}")
     if kind == "float" and isinstance(known[name], int):
         raise ConfigurationError(f"{where}: kind must be int, because {known[name]} is a whole number; got 'float'")
     if kind == "categorical":
@@ -155,11 +154,12 @@ def _bounds(entry: Mapping[str, Any], where: str, kind: str) -> list[Any]:
     return bounds
 
 
-def _try(setting: Setting, value: Any, base: DictConfig) -> None:
+def _try(setting: Setting, value: Any, base: TrainSettings) -> None:
     """Refuse a value that does not fit the rest of the configuration."""
-    changed = base.copy()
-    OmegaConf.update(changed, setting.name, value, merge=False)
+    changed = deepcopy(base.composed)
+    *sections, leaf = setting.name.split(".")
+    reduce(getitem, sections, changed)[leaf] = value
     try:
-        find_training(changed)
+        find_training(type(base).of(changed))
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"sweep.space, {setting.name}={json.dumps(value)}: {error}") from error

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 from attentionvote.command.configuration import compose
 from attentionvote.files import read_json, write_json
 from attentionvote.workflows.chain import MemberTask
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
 from attentionvote.workflows.tables.table import Row
+from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from attentionvote.part import Part
@@ -55,7 +57,7 @@ def network_cell(
     """
     from attentionvote.workflows.train.job import find_training
 
-    cfg = compose("train", [f"object={name}", *words["train"]])
+    cfg = compose(TrainSettings, [f"object={name}", *words["train"]])
     job = find_training(cfg)
     if job.result is None and not may_train:
         return None
@@ -116,7 +118,6 @@ def baseline_cell(
     Raises:
         ValueError: when OpenCV is missing, or the scenes cannot be had.
     """
-    from hydra.utils import instantiate
 
     from attentionvote.measurement.baseline_scenes import VARIANTS, ppf_results
     from attentionvote.measurement.figures import figures_of, machine
@@ -125,8 +126,8 @@ def baseline_cell(
     from attentionvote.training.operating_point import best_threshold
     from attentionvote.workflows.evaluate.frozen_set import generated_set, is_recorded, scenes_of, set_spec
 
-    cfg = compose("evaluate", [f"object={name}", *evaluate])
-    part: Part = instantiate(cfg.object)
+    cfg = compose(EvaluateSettings, [f"object={name}", *evaluate])
+    part: Part = cfg.object()
     settings = replace(VARIANTS[row.detector], **ppf)
     frozen = scenes_of(cfg, part)
     what = [asdict(settings), frozen.digest, part.digest, package_version("opencv-contrib-python-headless")]

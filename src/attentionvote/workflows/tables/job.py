@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.command.conf_folder import CONF
 from attentionvote.command.configuration import compose
@@ -15,6 +14,8 @@ from attentionvote.command.entry import configuring
 from attentionvote.command.errors import ConfigurationError, Refused, sentence
 from attentionvote.command.words import parse, words_beside, words_of
 from attentionvote.workflows.chain import words_of_verbs
+from attentionvote.workflows.evaluate.settings import EvaluateSettings
+from attentionvote.workflows.tables.settings import TablesSettings
 
 if TYPE_CHECKING:
     from attentionvote.workflows.tables.table import Row
@@ -29,7 +30,7 @@ IMAGES = "images"  # beside the page
 RECORDED = CONF / "evaluation" / "benchmark.yaml"
 
 
-def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
+def run(cfg: TablesSettings, words: Sequence[str]) -> dict[str, Any]:
     """Measure what can be measured of a table, and write it down.
 
     Args:
@@ -43,9 +44,8 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     from attentionvote.workflows.tables.record import BenchmarkRecord
     from attentionvote.workflows.tables.table import BenchmarkTable
 
-    plain: Any = OmegaConf.to_container(cfg.table, resolve=True)
     with configuring():
-        table = BenchmarkTable.of(table_name(words), plain)
+        table = BenchmarkTable.of(table_name(words), cfg.composed["table"])
         objects, rows = table.chosen(cfg.objects, cfg.rows)
     if cfg.record:
         return record(cfg, [*objects, *(row.together for row in rows if row.together)])
@@ -92,27 +92,30 @@ def run(cfg: DictConfig, words: Sequence[str]) -> dict[str, Any]:
     return result
 
 
-def _measure(cfg: DictConfig, words: Sequence[str], row: Row, name: str) -> dict[str, Any] | None:
+def _measure(cfg: TablesSettings, words: Sequence[str], row: Row, name: str) -> dict[str, Any] | None:
     from attentionvote.execution.hardware import cores
     from attentionvote.workflows.tables.cells import baseline_cell, network_cell
 
-    here, own = cfg.copy(), Path(cfg.benchmarks)
+    own = Path(cfg.benchmarks)
     part = words_of(("object",), words)
     # What a benchmark exports is nobody's newest model.
-    here.export = [f"outputs={own / 'export'}", *part, *cfg.export, *row.export]
-    here.evaluate = [f"outputs={own / 'evaluate'}", *part, *scene_words(words), *cfg.evaluate, *row.evaluate]
+    here = replace(
+        cfg,
+        export=(f"outputs={own / 'export'}", *part, *cfg.export, *row.export),
+        evaluate=(f"outputs={own / 'evaluate'}", *part, *scene_words(words), *cfg.evaluate, *row.evaluate),
+    )
     if row.detector == "network":
         verbs, _ = words_of_verbs(here, [*training_words(words, cfg.train), *row.train], name)
         return network_cell(verbs, name, cfg.train)
     # Where bundles lie and who signed them is nothing to the baseline.
     on = [f"root={cfg.root}", *here.evaluate, *(["force=true"] if cfg.force else [])]
-    ppf: Any = OmegaConf.to_container(cfg.ppf)
-    return baseline_cell(on, name, row, own, cfg.baseline_workers or cores(), ppf)
+    return baseline_cell(on, name, row, own, cfg.baseline_workers or cores(), cfg.composed["ppf"])
 
 
-def record(cfg: DictConfig, objects: Sequence[str]) -> dict[str, Any]:
+def record(cfg: TablesSettings, objects: Sequence[str]) -> dict[str, Any]:
     """Generate the frozen scenes of these parts and write their digests into ``RECORDED``; no mesh, no scenes."""
-    from hydra.utils import instantiate
+
+    from omegaconf import OmegaConf
 
     from attentionvote.files import write_whole
     from attentionvote.workflows.evaluate.frozen_set import generated_set, set_spec
@@ -120,10 +123,10 @@ def record(cfg: DictConfig, objects: Sequence[str]) -> dict[str, Any]:
     content: Any = OmegaConf.load(RECORDED)
     frozen = dict(content.get("frozen", {}))
     for name in objects:
-        own = compose("evaluate", [f"object={name}", f"root={cfg.root}", "evaluation=benchmark", *cfg.evaluate])
+        own = compose(EvaluateSettings, [f"object={name}", f"root={cfg.root}", "evaluation=benchmark", *cfg.evaluate])
         try:
             with configuring():
-                part = instantiate(own.object)
+                part = own.object()
         except ConfigurationError as error:
             log.warning("%s: %s", name, error)
             continue

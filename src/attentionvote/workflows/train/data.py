@@ -6,8 +6,6 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from attentionvote.command.executors import executor_of
 from attentionvote.data.clouds import Clouds, measure_clouds
 from attentionvote.data.dataset_split import DatasetSplit
@@ -16,12 +14,13 @@ from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import scene_set_directory
 from attentionvote.workflows.train.job import TrainingJob
 from attentionvote.workflows.train.processes import FirstDoes, Place
+from attentionvote.workflows.train.settings import TrainSettings
 
 _CYCLES_PER_PROCESS = 5
 
 
 def prepare_data(
-    cfg: DictConfig, job: TrainingJob, settings: CloudSettings, workers: int, place: Place, first_does: FirstDoes
+    cfg: TrainSettings, job: TrainingJob, settings: CloudSettings, workers: int, place: Place, first_does: FirstDoes
 ) -> tuple[dict[str, Clouds], dict[str, str]]:
     """Generate and measure what is missing, or measure a dataset, in the first process; open it in all.
 
@@ -59,7 +58,7 @@ def prepare_data(
 
 
 def _open(
-    cfg: DictConfig, place: Place, read_here: DatasetSplit | None, scenes: str, clouds: str, digest: str
+    cfg: TrainSettings, place: Place, read_here: DatasetSplit | None, scenes: str, clouds: str, digest: str
 ) -> Clouds:
     unseen = [path for path in (scenes, clouds) if not Path(path).is_dir()]
     if unseen:

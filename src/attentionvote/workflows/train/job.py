@@ -7,20 +7,17 @@ import json
 import logging
 import shutil
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
-
 from attentionvote.command.executors import executor_of
-from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.command.identity import without
 from attentionvote.files import locked_folder, read_json
 from attentionvote.part import Parts, only_part
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
-from attentionvote.simulation.sensor import Sensor
 from attentionvote.workflows.train.network import check_classes
+from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from attentionvote.data.dataset_splits import DatasetSplits
@@ -78,29 +75,24 @@ class TrainingJob:
         return locked_folder(self.directory, str(self.directory.parents[1]), "training")
 
 
-def find_training(cfg: DictConfig) -> TrainingJob:
+def find_training(cfg: TrainSettings) -> TrainingJob:
     """The training of a configuration: new, interrupted or complete; the configuration's parts are checked together.
 
     Raises:
         ValueError: with one sentence, when the parts of the configuration do not fit together.
         OSError: when the part's mesh is missing.
     """
-    part: Parts = instantiate(cfg.object)
-    simulation: Any = OmegaConf.to_container(cfg.simulation, resolve=True)
-    specs = scene_set_specs(part, simulation)
+    part: Parts = cfg.object()
+    specs = scene_set_specs(part, cfg.simulation)
     check_classes(cfg.model.classes, part)
     for split in ("train", "val", "test"):
         if split not in specs:
             raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
     job = TrainingJob(Path(cfg.outputs) / part.name, part, specs)
     if cfg.data.dataset is not None:
-        job = replace(job, specs={}, dataset=_dataset(cfg, part))
+        job = replace(job, specs={}, dataset=_dataset(cfg, cfg.data.dataset, part))
     _check(cfg, job.scene_counts["train"])
-    plain = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(plain, dict)
-    for key in NOT_IDENTITY:
-        section, _, leaf = key.rpartition(".")
-        (plain[section] if section else plain).pop(leaf, None)
+    plain = without(cfg.composed)
     if len(part.parts) > 1:  # whether the number was also typed makes no other training
         plain["model"]["classes"] = len(part.parts)
     del plain["data"]["held_out"]  # what was trained without a dataset keeps its digest
@@ -113,21 +105,20 @@ def find_training(cfg: DictConfig) -> TrainingJob:
     return replace(job, directory=job.directory / digest[:12])
 
 
-def _dataset(cfg: DictConfig, part: Parts) -> DatasetSplits:
+def _dataset(cfg: TrainSettings, folder: str, part: Parts) -> DatasetSplits:
     from attentionvote.data.dataset_split import check_sensor
     from attentionvote.data.dataset_splits import DatasetSplits
 
-    check_sensor(Sensor(**cfg.data.sensor))
+    check_sensor(cfg.data.sensor)
     only = only_part(part, "data.dataset")
-    return DatasetSplits.open(Path(cfg.data.dataset), only, {str(k): float(v) for k, v in cfg.data.held_out.items()})
+    return DatasetSplits.open(Path(folder), only, asdict(cfg.data.held_out))
 
 
-def _check(cfg: DictConfig, scenes: int) -> None:
+def _check(cfg: TrainSettings, scenes: int) -> None:
     from attentionvote.tracking.store import resolve_store
 
     resolve_store(cfg.tracking.store)
     executor_of(cfg)
-    Sensor(**cfg.data.sensor)
     if cfg.trainer.batch_size > scenes:
         raise ValueError(
             f"trainer.batch_size must be at most the {scenes} training scenes, got {cfg.trainer.batch_size}"
@@ -139,7 +130,7 @@ def _check(cfg: DictConfig, scenes: int) -> None:
             f"trained; got {cfg.trainer.schedule.vote_steps}"
         )
     if cfg.model.refinement is not None and cfg.model.refinement_steps:
-        if not cfg.loss.weights.get("refined", 0) > 0:
+        if not cfg.loss.weights.refined > 0:
             raise ValueError(
                 "loss.weights.refined must be greater than 0 with model.refinement, got 0: set one of them"
             )

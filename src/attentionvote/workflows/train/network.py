@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
+from attentionvote.model.settings import NetworkSettings
 from attentionvote.part import Parts
 
 
@@ -23,16 +22,15 @@ def check_classes(classes: int, parts: Parts) -> None:
         )
 
 
-def network_arguments(model: DictConfig, parts: Parts) -> dict[str, Any]:
+def network_arguments(model: NetworkSettings, parts: Parts) -> dict[str, Any]:
     """Arguments of the network: the settings, and what the parts decide (lengths, box, classes)."""
-    arguments = OmegaConf.to_container(model, resolve=True)
-    assert isinstance(arguments, dict)
+    arguments = asdict(model)
     arguments |= {"diameter": parts.diameter, "box": parts.box.tolist(), "classes": len(parts.parts)}
     if len(parts.parts) > 1 and arguments["merge_fraction"] is not None:
         # The box holds all parts; stacked instances of the thinnest must stay apart all the same.
         thinnest = min(float((part.box[1] - part.box[0]).min()) for part in parts.parts)
         arguments["merge_fraction"] = min(arguments["merge_fraction"], 0.5 * thinnest / parts.diameter)
-    return {str(key): value for key, value in arguments.items()}
+    return arguments
 
 
 def described(parts: Parts) -> dict[str, Any]:

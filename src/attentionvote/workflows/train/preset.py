@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from attentionvote.workflows.train.processes import Place, be_silent, refuse_grid
+from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
 
@@ -39,7 +38,7 @@ def preset_of_hardware(words: list[str]) -> list[str]:
     return [f"experiment={preset}"]
 
 
-def preset_of_workers(cfg: DictConfig, words: Sequence[str]) -> list[str]:
+def preset_of_workers(cfg: TrainSettings, words: Sequence[str]) -> list[str]:
     """The preset of the machines that train: of this one, or on a cluster what the jobs are given.
 
     The machine that submits says nothing about those that train: a cluster's jobs have a GPU when they ask for one.

@@ -11,29 +11,24 @@ from typing import Any
 
 import lightning as L
 import torch
-from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig
 
 from attentionvote import __version__
 from attentionvote.data.clouds import Clouds
 from attentionvote.data.datamodule import PartDataModule
-from attentionvote.data.samples import Augmentation
 from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution.hardware import cores
 from attentionvote.files import write_json
-from attentionvote.model import AttentionVote
-from attentionvote.simulation.sensor import Sensor
+from attentionvote.model.network import AttentionVote
 from attentionvote.tracking.store import connect, resolve_store
 from attentionvote.training.checkpoint import FORMAT, usable_checkpoint
 from attentionvote.training.checkpoint_writer import AtomicCheckpoints
-from attentionvote.training.losses import AttentionVoteLoss, LossSettings
+from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.messages import plain_loader_errors, quiet_lightning
 from attentionvote.training.module import PoseTraining
 from attentionvote.training.pictures import ScenePictures
 from attentionvote.training.progress import TrainingProgress
-from attentionvote.training.schedule import Schedule
 from attentionvote.training.synced_norm import RowNormSync
 from attentionvote.training.termination import PlainTermination
 from attentionvote.workflows.sweep.trial_report import trial_callbacks
@@ -42,6 +37,7 @@ from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
 from attentionvote.workflows.train.network import described, network_arguments
 from attentionvote.workflows.train.processes import FirstDoes, Place
 from attentionvote.workflows.train.results import Found, assess, best_score, detect_everything, log_losses
+from attentionvote.workflows.train.settings import TrainSettings
 from attentionvote.workflows.train.tracking import open_tracking
 
 log = logging.getLogger("attentionvote.train")
@@ -58,7 +54,7 @@ class TrainingRun:
         ValueError: with one sentence, when a setting of model, loss, data or trainer is impossible.
     """
 
-    def __init__(self, cfg: DictConfig, job: TrainingJob, place: Place, first_does: FirstDoes) -> None:
+    def __init__(self, cfg: TrainSettings, job: TrainingJob, place: Place, first_does: FirstDoes) -> None:
         self.cfg, self.job, self.part = cfg, job, job.part
         self.place, self.first_does = place, first_does
         part, t = job.part, cfg.trainer
@@ -66,15 +62,13 @@ class TrainingRun:
         self.threads = t.threads or place.cores
         torch.set_num_threads(self.threads)
         arguments = network_arguments(cfg.model, part)
-        model: AttentionVote = instantiate(arguments, _convert_="all")
-        loss = AttentionVoteLoss(part, cfg.loss.weights, LossSettings(**cfg.loss.settings))
-        self.clouds = CloudSettings(
-            Sensor(**cfg.data.sensor), cfg.data.density, cfg.data.pool, cfg.data.normal_neighbors
-        )
+        model: AttentionVote = AttentionVote(**arguments)
+        loss = AttentionVoteLoss(part, asdict(cfg.loss.weights), cfg.loss.settings)
+        self.clouds = CloudSettings(cfg.data.sensor, cfg.data.density, cfg.data.pool, cfg.data.normal_neighbors)
         metadata = {
             "format": FORMAT,
             "version": __version__,
-            "model": {str(k): v for k, v in arguments.items() if k != "_target_"},
+            "model": arguments,
             **described(part),
             "points": cfg.data.points,
             "clouds": asdict(self.clouds),
@@ -87,7 +81,7 @@ class TrainingRun:
             model,
             loss,
             part,
-            Schedule(**t.schedule),
+            t.schedule,
             t.optimizer,
             t.learning_rate,
             t.weight_decay,
@@ -95,7 +89,7 @@ class TrainingRun:
             t.train_heat,
             json.loads(json.dumps(metadata)),  # plain values only: what torch.load(weights_only=True) accepts
         )
-        self.augmentation = Augmentation(**cfg.data.augmentation)
+        self.augmentation = cfg.data.augmentation
         self.workers = cfg.workers or cores()
         with quiet_lightning():
             self.trainer = self._trainer()

@@ -6,19 +6,18 @@ import json
 import logging
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from attentionvote.files import write_json
 from attentionvote.tracking.run import Run
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.training.module import PoseTraining
 from attentionvote.workflows.train.job import RUN, TrainingJob
+from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
 DATASET = "dataset.json"
 
 
-def open_tracking(cfg: DictConfig, job: TrainingJob, module: PoseTraining, processes: int) -> Run:
+def open_tracking(cfg: TrainSettings, job: TrainingJob, module: PoseTraining, processes: int) -> Run:
     """The run of a training, the one it began with where the store still has it.
 
     Args:
@@ -47,7 +46,7 @@ def open_tracking(cfg: DictConfig, job: TrainingJob, module: PoseTraining, proce
         "name": f"{part.name}-{job.directory.name}",
         "params": choices,
         "tags": {"processes": processes},
-        "config_yaml": OmegaConf.to_yaml(cfg, resolve=True),
+        "config_yaml": cfg.yaml(),
         "datasets": {split: module.metadata["data"][split] for split in counts},
         "system_interval_s": cfg.tracking.system_interval,
         "parent": cfg.tracking.parent,
