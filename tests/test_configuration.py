@@ -1,28 +1,26 @@
-"""Every file under conf/ composes, and what it names with _target_ exists and takes the keys beside it."""
+"""Every file under conf/ composes into the settings of a verb, and every object describes a part."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
-from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
+from settings_of_verbs import settings_of
 
 from attentionvote.command.conf_folder import CONF, primary_groups
-from attentionvote.command.configuration import compose, leaves
-from attentionvote.command.schema import violation
+from attentionvote.command.configuration import compose
 from attentionvote.part import Part, PartSet
+from attentionvote.setting import Target
 
 FILES = sorted(CONF.rglob("*.yaml"))
 VERBS = [p.stem for p in FILES if p.parent == CONF]
 OBJECTS = [p.stem for p in FILES if p.parent.name == "object"]
 MANDATORY = {"benchmark": ["table=table_6"], "part": ["name=bracket", "mesh=bracket.stl"]}
-INSTANTIATE_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_", "_args_"}
 
 
 def identifier(path: Path) -> str:
@@ -52,29 +50,14 @@ def composed(path: Path) -> Any:
     for verb in VERBS:
         if group in defaults_of(verb):
             words = [w for w in words_for(verb) if not w.startswith(f"{group}=")]
-            return compose(verb, [*words, f"{group}={path.stem}"])
+            return compose(settings_of(verb), [*words, f"{group}={path.stem}"])
     raise AssertionError(f"no verb has the group {group}: the file is dead")
 
 
-def targets(node: Any) -> Iterator[Mapping[str, Any]]:
-    """Every mapping that is to be instantiated."""
-    if isinstance(node, Mapping):
-        if "_target_" in node:
-            yield node
-        for value in node.values():
-            yield from targets(value)
-    elif isinstance(node, list):
-        for item in node:
-            yield from targets(item)
-
-
 @pytest.mark.parametrize("path", FILES, ids=identifier)
-def test_file_composes_and_its_targets_take_its_keys(path: Path) -> None:
-    cfg = composed(path) if group_of(path) else compose(path.stem, words_for(path.stem))
-    for node in targets(OmegaConf.to_container(cfg, resolve=True)):
-        target = get_object(node["_target_"])
-        arguments = {key: None for key in node if key not in INSTANTIATE_KEYS}
-        inspect.signature(target).bind_partial(**arguments)
+def test_file_composes(path: Path) -> None:
+    cfg = composed(path) if group_of(path) else compose(settings_of(path.stem), words_for(path.stem))
+    assert cfg.composed
 
 
 @pytest.mark.parametrize("path", FILES, ids=identifier)
@@ -91,10 +74,12 @@ def test_primary_lists_start_with_self_so_that_an_experiment_wins() -> None:
             assert primary["defaults"][0] == "_self_", verb
 
 
-def part_settings(name: str) -> Any:
+def part_settings(name: str) -> Target:
     """The section of one object, without a verb around it."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return hydra_compose(f"object/{name}").object
+        section = OmegaConf.to_container(hydra_compose(f"object/{name}").object, resolve=True)
+    assert isinstance(section, dict)
+    return Target.of({str(key): value for key, value in section.items()})
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -102,25 +87,21 @@ def test_object_describes_a_part(
     name: str, shared_data: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ATTENTIONVOTE_DATA", "nowhere")
-    settings = part_settings(name)
-    assert settings.name == name
-    assert not [
-        v for key, value in leaves({"object": OmegaConf.to_container(settings)}) if (v := violation(key, value))
-    ]
+    assert part_settings(name).name == name
     if "ATTENTIONVOTE_DATA" in (CONF / "object" / f"{name}.yaml").read_text(encoding="utf-8"):
         # The mesh is the user's: without it the sentence says where it belongs, with it the part loads.
-        with pytest.raises(Exception, match=r"must be at 'nowhere/meshes/"):
-            instantiate(settings)
+        with pytest.raises(FileNotFoundError, match=r"must be at 'nowhere/meshes/"):
+            part_settings(name)()
         monkeypatch.setenv("ATTENTIONVOTE_DATA", str(shared_data("")))
-        settings = part_settings(name)
-        if not Path(settings.mesh).exists():
-            pytest.skip(f"the check data has no {Path(settings.mesh).name}")
-    part = instantiate(settings)
+        if not (mesh := Path(part_settings(name).arguments["mesh"])).exists():
+            pytest.skip(f"the check data has no {mesh.name}")
+    settings = part_settings(name)
+    part = settings()
     assert part.name == name
-    if "parts" in settings:
+    if members := settings.arguments.get("parts"):
         assert isinstance(part, PartSet)
-        assert [one.name for one in part.parts] == list(settings.parts)
-        assert part.diameter == max(one.diameter for one in settings.parts.values())
+        assert [one.name for one in part.parts] == list(members)
+        assert part.diameter == max(one["diameter"] for one in members.values())
         return
     assert isinstance(part, Part)
-    assert part.diameter == pytest.approx(settings.diameter)
+    assert part.diameter == pytest.approx(settings.arguments["diameter"])

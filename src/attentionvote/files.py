@@ -100,3 +100,15 @@ def is_locked(folder: Path) -> bool:
         except BlockingIOError:
             return True
         return False
+
+
+def cache_folder() -> Path:
+    """Where things computed once per machine are kept: ``ATTENTIONVOTE_CACHE``, else the user's cache folder."""
+    if named := os.environ.get("ATTENTIONVOTE_CACHE"):
+        return Path(named)
+    if named := os.environ.get("XDG_CACHE_HOME"):
+        return Path(named) / "attentionvote"
+    try:
+        return Path.home() / ".cache" / "attentionvote"
+    except RuntimeError:  # a user without a home; libraries are loaded from nowhere that others may write to
+        return Path(f"/run/user/{os.getuid()}/attentionvote")

@@ -160,6 +160,23 @@ class Target:
     path: str
     arguments: Mapping[str, Any]
 
+    @classmethod
+    def of(cls, values: Mapping[str, Any], key: str = "") -> Target:
+        """A section of plain values, checked against the signature of its target.
+
+        Raises:
+            SettingError: as ``read``.
+        """
+        if "_target_" not in values:
+            raise SettingError(
+                f"{key or 'a section'} must have _target_, the dotted name of what it configures; got none"
+            )
+        # Other keys that begin with an underscore steer Hydra's own way of calling a target.
+        arguments = {str(name): item for name, item in values.items() if not str(name).startswith("_")}
+        path = str(values["_target_"])
+        _arguments(located(path), arguments, key)
+        return cls(path, arguments)
+
     @property
     def name(self) -> str:
         """The argument ``name``."""
@@ -265,11 +282,7 @@ def _value(key: str, value: Any, type_: Any, setting: Setting) -> Any:
         if not isinstance(value, Mapping):
             raise SettingError(f"{key} must be a section{' or null' if nullable else ''}; got {value!r}")
         if type_ is Target:
-            arguments = {str(name): item for name, item in value.items() if name != "_target_"}
-            if "_target_" not in value:
-                raise SettingError(f"{key}._target_ must be given, the dotted name of what {key} configures")
-            _arguments(located(str(value["_target_"])), arguments, key)
-            return Target(str(value["_target_"]), arguments)
+            return Target.of(value, key)
         return read(type_, value, key)  # type: ignore[arg-type]
     if origin in (dict, Mapping):
         if not isinstance(value, Mapping):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from attentionvote.files import cache_folder
 from attentionvote.geometry import native
 from attentionvote.inference.bundles.signature import KEYS_VARIABLE, keys_folder
 from attentionvote.inference.errors import InputError
@@ -43,7 +44,7 @@ def test_a_user_without_a_home_gets_a_sentence() -> None:
 
 @pytest.mark.usefixtures("homeless")
 def test_compiled_code_is_looked_for_where_nobody_else_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert native.cache_folder() == Path(f"/run/user/{os.getuid()}/attentionvote")
+    assert cache_folder() == Path(f"/run/user/{os.getuid()}/attentionvote")
     assert native.load("attentionvote.geometry", "normals.c", make=False) is None
     monkeypatch.setenv("ATTENTIONVOTE_CACHE", "")  # not the current folder
-    assert native.cache_folder().is_absolute()
+    assert cache_folder().is_absolute()

@@ -30,7 +30,6 @@ def preset(repository: Path, name: str) -> dict[str, Any]:
     config = OmegaConf.create({"object": scales, "model": OmegaConf.load(repository / f"conf/model/{name}.yaml")})
     arguments = OmegaConf.to_container(config.model, resolve=True)
     assert isinstance(arguments, dict)
-    assert arguments.pop("_target_") == "attentionvote.model.AttentionVote"
     return arguments
 
 

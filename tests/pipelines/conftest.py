@@ -24,8 +24,9 @@ def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from scipy.spatial import ConvexHull
 
     from attentionvote.command.configuration import compose
+    from attentionvote.files import cache_folder
     from attentionvote.simulation.cad import BUILTIN_PARTS
-    from attentionvote.simulation.decomposition import cache_directory, hull_file
+    from attentionvote.simulation.decomposition import hull_file
     from attentionvote.simulation.part_files import load_part
 
     base = tmp_path_factory.getbasetemp()
@@ -41,7 +42,7 @@ def parts_of_one_piece(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 piece = part.vertices[ConvexHull(part.vertices).vertices]
                 path = hull_file(part, drop.hull_threshold, drop.hull_vertices, folder)
                 np.savez(folder / "new" / path.name, hull_000=piece)
-            for library in cache_directory().glob("*.so"):  # else everything is compiled again
+            for library in cache_folder().glob("*.so"):  # else everything is compiled again
                 shutil.copy(library, folder)
             (folder / "new").rename(folder / "hulls")
     return folder

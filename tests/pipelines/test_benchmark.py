@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,6 @@ def test_what_cannot_be_is_said_before_any_work(tmp_path: Path, words: list[str]
 @pytest.mark.parametrize("known", ["", "frozen: {zebra: abc}\n"])
 def test_the_frozen_scenes_are_recorded_by_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
     """And an evaluation on scenes with another digest says so."""
-    from hydra.utils import instantiate
     from omegaconf import OmegaConf
 
     from attentionvote.workflows.evaluate.frozen_set import generated_set, is_recorded, set_spec
@@ -140,13 +140,13 @@ def test_the_frozen_scenes_are_recorded_by_digest(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
     answer = benchmark.record(cfg, ["bunny", "brick"])  # the first has no mesh here
     own = compose(EvaluateSettings, ["object=brick", "evaluation=benchmark", f"root={tmp_path}", *few])
-    part = instantiate(own.object)
+    part = own.object()
     frozen = generated_set(own, part, set_spec(own, part))
     assert answer["frozen"] == {"brick": frozen.scenes.digest} | ({"zebra": "abc"} if known else {})
     assert recorded.read_text().startswith("# why\ndefaults:\n")
     assert list(OmegaConf.load(recorded).frozen) == list(answer["frozen"])
     for digest, expected in ((frozen.scenes.digest, True), ("0" * 64, False)):
-        OmegaConf.update(own, "evaluation.frozen", {"brick": digest}, force_add=True)
-        assert is_recorded(own, part, frozen) is expected
-    OmegaConf.update(own, "evaluation.frozen", {}, merge=False)
-    assert is_recorded(own, part, frozen) is None
+        known = replace(own, evaluation=replace(own.evaluation, frozen={"brick": digest}))
+        assert is_recorded(known, part, frozen) is expected
+    nothing = replace(own, evaluation=replace(own.evaluation, frozen={}))
+    assert is_recorded(nothing, part, frozen) is None

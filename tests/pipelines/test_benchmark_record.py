@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
 
 from attentionvote.command.configuration import compose
 from attentionvote.workflows.page_sections import put
@@ -71,7 +70,7 @@ def test_a_bin_of_several_parts_is_a_cell_a_part() -> None:
 def test_the_projects_page_shows_what_its_files_keep(place: Path, tmp_path: Path) -> None:
     """Nobody has changed a number on the page, or the table, by hand."""
     cfg = compose(TablesSettings, [f"table={place.stem}"])
-    table = BenchmarkTable.of(place.stem, OmegaConf.to_container(cfg.table, resolve=True))  # type: ignore[arg-type]
+    table = BenchmarkTable.of(place.stem, cfg.composed["table"])
     cells = BenchmarkRecord.beside(str(DOCS / "benchmarks.md"), table.name).cells
     assert {row for row, _ in cells} <= {row.name for row in table.measured}
     text = (DOCS / "benchmarks.md").read_text(encoding="utf-8")

@@ -26,6 +26,19 @@ SCRIPT = '''
 import logging, os, sys, time
 from pathlib import Path
 from attentionvote.command.entry import command, configuring
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+from attentionvote.command.configuration import VerbSettings
+from attentionvote.setting import Setting
+@dataclass(frozen=True)
+class Rate:
+    lr: Annotated[float, Setting("Rate.", above=0, high=10)]
+@dataclass(frozen=True, kw_only=True)
+class FakeSettings(VerbSettings):
+    verb: ClassVar[str] = "fake"
+    object: Annotated[dict[str, str], Setting("Part.")]
+    trainer: Rate
+    do: Annotated[str, Setting("What.")]
 log = logging.getLogger("attentionvote.fake")
 def run(cfg):
     print("a library prints"); os.system("echo a child prints"); log.info("working")
@@ -39,11 +52,11 @@ def run(cfg):
         try: raise KeyboardInterrupt
         except KeyboardInterrupt: sys.exit(1)
     import numpy as np
-    return {{"stage": "fake", "object": cfg.object.name, "lr": np.float64(cfg.trainer.lr), "do": cfg.do}}
+    return {{"stage": "fake", "object": cfg.object["name"], "lr": np.float64(cfg.trainer.lr), "do": cfg.do}}
 def defaults(words):
     return [] if any(w.startswith("do=") for w in words) else ["do=default of the machine"]
 if __name__ == "__main__":
-    command("fake", run, defaults=defaults, conf=Path({conf!r}))
+    command(FakeSettings, run, defaults=defaults, conf=Path({conf!r}))
 '''
 
 

@@ -11,7 +11,6 @@ import evaluate
 import numpy as np
 import pytest
 import write_data
-from hydra.utils import instantiate
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -37,7 +36,7 @@ def ipa(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def brick() -> Any:
     """The part."""
-    return instantiate(compose(EvaluateSettings, ["object=brick"]).object)
+    return compose(EvaluateSettings, ["object=brick"]).object()
 
 
 def test_scored_scenes_come_without_background_and_thinned(ipa: Path, brick: Any) -> None:

@@ -31,9 +31,12 @@ def test_settings_become_an_executor() -> None:
     [
         (["executor=dask"], "executor must be one of local, ray, slurm; got 'dask'"),
         (["executor=slrum"], "did you mean 'slurm'"),
-        (["cluster.slurm.minutes=0"], "cluster.slurm.minutes must be at least 1; got 0"),
-        (["cluster.slurm.memory_gb=0"], "cluster.slurm.memory_gb must be a number greater than 0; got 0"),
-        (["cluster.gpus=-1.0"], r"cluster.gpus must be at least 0; got -1.0"),
+        (["cluster.slurm.minutes=0"], "cluster.slurm.minutes must be at least 1 and at most 1000000; got 0"),
+        (
+            ["cluster.slurm.memory_gb=0"],
+            "cluster.slurm.memory_gb must be a number greater than 0 and at most 100000; got 0",
+        ),
+        (["cluster.gpus=-1.0"], r"cluster.gpus must be at least 0 and at most 1024; got -1.0"),
     ],
 )
 def test_impossible_settings_are_one_sentence(words: list[str], message: str) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from hydra.utils import instantiate
 
 from attentionvote.command.configuration import compose
 from attentionvote.evaluation.by_part import COUNTS
@@ -55,8 +54,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained")
     python("generate.py", *SCENES, "splits=[test]", "workers=1", folder=folder)
     cfg = compose(TrainSettings, [*OBJECT, "experiment=compact", *NETWORK])
-    parts: PartSet = instantiate(cfg.object)
-    network = {k: v for k, v in network_arguments(cfg.model, parts).items() if k != "_target_"}
+    parts: PartSet = cfg.object()
+    network = network_arguments(cfg.model, parts)
     torch.manual_seed(0)
     scenes = SceneSet.open(next((folder / "data" / "scenes" / "industrial").glob("test-*")))
     metadata = {
@@ -78,7 +77,7 @@ def test_a_model_of_two_parts_becomes_a_bundle_and_is_evaluated(trained: Path) -
     exported = python("export.py", *OBJECT, "limits.scenes=2", "scenes=4", "golden=1", "workers=1", folder=trained)
     bundle = load_bundle(trained / exported["bundle"], trained / "keys" / "signing.pub")
     cfg = compose(GenerateSettings, OBJECT)
-    parts: PartSet = instantiate(cfg.object)
+    parts: PartSet = cfg.object()
     assert bundle.card.classes == NAMES
     assert [part.digest for part in bundle.card.parts] == [part.digest for part in parts.parts]
     assert [part.symmetry for part in bundle.card.parts] == [

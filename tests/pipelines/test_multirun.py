@@ -10,9 +10,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from omegaconf import OmegaConf
 
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, resolve_store
@@ -22,6 +22,20 @@ SCRIPT = '''
 import json, os, signal, sys, time
 from pathlib import Path
 from attentionvote.command.entry import command, configuring
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+from attentionvote.command.configuration import VerbSettings
+from attentionvote.setting import Setting
+@dataclass(frozen=True)
+class Rate:
+    lr: Annotated[float, Setting("Rate.", above=0, high=10)]
+@dataclass(frozen=True, kw_only=True)
+class FakeSettings(VerbSettings):
+    verb: ClassVar[str] = "fake"
+    object: Annotated[dict[str, str], Setting("Part.")]
+    trainer: Rate
+    do: Annotated[str, Setting("What.")]
+    tracking: Annotated[dict[str, Any], Setting("Store.")]
 def run(cfg):
     print("a library prints")
     Path(f"pid-{{cfg.do}}").write_text(str(os.getpid()))
@@ -32,15 +46,15 @@ def run(cfg):
     if cfg.do == "crash": os.kill(os.getpid(), signal.SIGSEGV)
     if cfg.do == "silent": os._exit(0)
     if cfg.do == "wait": print("ready", file=sys.stderr, flush=True); time.sleep(60)
-    Path(f"out-{{cfg.object.name}}-{{cfg.trainer.lr}}").touch(exist_ok=False)
+    Path(f"out-{{cfg.object['name']}}-{{cfg.trainer.lr}}").touch(exist_ok=False)
     parent = cfg.tracking.get("parent")
-    run_id = Path(f"run-{{cfg.object.name}}").read_text() if parent else None
-    about = {{"object": cfg.object.name, "lr": cfg.trainer.lr, "do": cfg.do}}
+    run_id = Path(f"run-{{cfg.object['name']}}").read_text() if parent else None
+    about = {{"object": cfg.object["name"], "lr": cfg.trainer.lr, "do": cfg.do}}
     return {{"stage": "fake", **about, "run_id": run_id, "parent": parent}}
 def check(cfg):
     if cfg.trainer.lr > 5: raise ValueError(f"lr must be small here, got {{cfg.trainer.lr}}")
 if __name__ == "__main__":
-    command("fake", run, check=check, conf=Path({conf!r}))
+    command(FakeSettings, run, check=check, conf=Path({conf!r}))
 '''
 
 
@@ -204,7 +218,7 @@ def test_the_parent_of_one_part_lives_with_its_runs(put_tables: Callable[[Path],
 
     store = put_tables(tmp_path / "mlflow.db")
     settings = {"object": {"name": "gear"}, "tracking": {"store": store, "parent": None}}
-    jobs = [OmegaConf.create({**settings, "lr": lr}) for lr in (1, 2)]
+    jobs = [SimpleNamespace(composed={**settings, "lr": lr}) for lr in (1, 2)]
     opened = []
     for chosen in (jobs, jobs[:1], list(reversed(jobs))):
         run = multirun._open_parent("train", "lr=1,2", [["lr=1"], ["lr=2"]], chosen)

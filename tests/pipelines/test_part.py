@@ -11,13 +11,13 @@ import numpy as np
 import part
 import pytest
 import trimesh
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from attentionvote.command.conf_folder import CONF
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.setting import Target
 from attentionvote.simulation.symmetry_detection import symmetry_residual
 from attentionvote.workflows.settings import PartSettings
 
@@ -43,7 +43,7 @@ def test_a_file_becomes_an_object_that_loads(mesh_file: Path, tmp_path: Path) ->
     assert json.loads(json.dumps(result, default=lambda v: v.tolist()))["stage"] == "part"
     assert sorted(p.name for p in (tmp_path / "parts").iterdir()) == ["step_wedge.ply", "step_wedge.png"]
     assert [p.name for p in (tmp_path / "object").iterdir()] == ["step_wedge.yaml"]
-    loaded = instantiate(OmegaConf.load(tmp_path / "object" / "step_wedge.yaml"))
+    loaded = Target.of(OmegaConf.to_container(OmegaConf.load(tmp_path / "object" / "step_wedge.yaml")))()
     assert (loaded.name, loaded.title) == ("step_wedge", "Step wedge")
     assert loaded.diameter == result["diameter"] == pytest.approx(0.001 * np.linalg.norm([50, 25, 20]), rel=0.2)
     assert loaded.symmetry == Symmetry("cyclic", order=2)

@@ -21,6 +21,7 @@ from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.registry.versions import Versions
 from attentionvote.tracking.run_opening import start_run
+from attentionvote.workflows.settings import HistorySettings, PromoteSettings, RollbackSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,6 +46,9 @@ def model(export_brick, store, work_tree):
     return make
 
 
+SETTINGS = {"promote": PromoteSettings, "rollback": RollbackSettings, "history": HistorySettings}
+
+
 @pytest.fixture
 def verb(store, few_scenes, easy_gates):
     """Runs one of the verbs."""
@@ -52,7 +56,7 @@ def verb(store, few_scenes, easy_gates):
     def call(name: str, *words: str):
         module = {"promote": promote, "rollback": rollback, "history": history}[name]
         settings = [*few_scenes, *easy_gates] if name == "promote" else ["object=brick"]
-        return module.run(compose(name, [*settings, f"tracking.store='{store}'", *words]))
+        return module.run(compose(SETTINGS[name], [*settings, f"tracking.store='{store}'", *words]))
 
     return call
 

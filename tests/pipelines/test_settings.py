@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import sys
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import pytest
+from settings_of_verbs import settings_of
 
 from attentionvote.command.conf_folder import CONF, SCRIPTS, choices, primary_groups
-from attentionvote.command.configuration import VerbSettings, compose, leaves
+from attentionvote.command.configuration import compose, leaves
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.setting import Field, SettingError, Target, check_value, find, without_null
 from attentionvote.setting import leaves as fields_below
@@ -22,22 +21,6 @@ from attentionvote.workflows.train.settings import TrainSettings
 VERBS = sorted(path.stem for path in CONF.glob("*.yaml"))
 # Symmetries and other things that their own code checks.
 UNTYPED = ("object.symmetry", "object.parts", "table.", "sweep.space", "evaluation.frozen")
-
-
-@cache
-def settings_of(verb: str) -> type[VerbSettings]:
-    """The class that a verb's script hands to ``command``."""
-    spec = importlib.util.spec_from_file_location(f"script_of_{verb}", SCRIPTS / f"{verb}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    (found,) = [
-        value for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, VerbSettings) and getattr(value, "verb", None) == verb
-    ]  # fmt: skip
-    return found
 
 
 @cache

@@ -6,12 +6,13 @@ import json
 from dataclasses import replace
 
 import pytest
-from omegaconf import OmegaConf
 
+from attentionvote.command.configuration import compose
 from attentionvote.part import Part, PartSet, only_part
 from attentionvote.workflows.train.network import check_classes, described, network_arguments
+from attentionvote.workflows.train.settings import TrainSettings
 
-MODEL = OmegaConf.create({"_target_": "network", "classes": 1, "merge_fraction": 0.08, "head": [16]})
+MODEL = compose(TrainSettings, ["object=gear", "model=smoke"]).model
 
 
 def test_a_part_passes_and_a_set_is_refused_with_its_parts(box: Part, box_and_slab: PartSet) -> None:
@@ -38,8 +39,8 @@ def test_the_network_is_as_large_as_the_largest_part_and_merges_as_the_thinnest_
     both = network_arguments(MODEL, box_and_slab)
     assert (both["diameter"], both["classes"]) == (0.096, 2)
     assert both["merge_fraction"] * both["diameter"] == pytest.approx(0.5 * 0.012)
-    assert network_arguments(OmegaConf.merge(MODEL, {"merge_fraction": 0.01}), box_and_slab)["merge_fraction"] == 0.01  # type: ignore[arg-type]
-    assert network_arguments(OmegaConf.merge(MODEL, {"merge_fraction": None}), box_and_slab)["merge_fraction"] is None  # type: ignore[arg-type]
+    assert network_arguments(replace(MODEL, merge_fraction=0.01), box_and_slab)["merge_fraction"] == 0.01
+    assert network_arguments(replace(MODEL, merge_fraction=None), box_and_slab)["merge_fraction"] is None
 
 
 def test_a_checkpoint_keeps_a_part_as_ever_and_of_a_set_every_part(box: Part, box_and_slab: PartSet) -> None:

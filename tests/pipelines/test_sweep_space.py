@@ -6,10 +6,9 @@ from typing import Any
 
 import optuna
 import pytest
-from omegaconf import DictConfig, OmegaConf
 
 from attentionvote.command.conf_folder import CONF, choices
-from attentionvote.command.configuration import compose
+from attentionvote.command.configuration import compose, leaves
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.sweep.space import parse_space
@@ -19,7 +18,7 @@ RATE = {"name": "trainer.learning_rate", "kind": "float", "low": 0.001, "high": 
 
 
 @pytest.fixture(scope="module")
-def base() -> DictConfig:
+def base() -> TrainSettings:
     return compose(TrainSettings, ["object=brick", "experiment=smoke"])
 
 
@@ -57,21 +56,21 @@ def base() -> DictConfig:
         ({"name": "seed", "kind": "categorical", "choices": [1, 1]}, "choices must differ, got 1 2 times"),
     ],
 )  # fmt: skip
-def test_an_impossible_entry_is_one_sentence(base: DictConfig, entry: dict[str, Any], message: str) -> None:
+def test_an_impossible_entry_is_one_sentence(base: TrainSettings, entry: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message.replace("?", r"\?").replace("{'", r"\{'")) as error:
         parse_space([entry], base)
     assert "\n" not in str(error.value)
     assert str(error.value).startswith("sweep.space") or "sweep.space" in str(error.value)
 
 
-def test_an_empty_space_and_a_name_twice_are_refused(base: DictConfig) -> None:
+def test_an_empty_space_and_a_name_twice_are_refused(base: TrainSettings) -> None:
     with pytest.raises(ConfigurationError, match="at least one setting, got none"):
         parse_space([], base)
     with pytest.raises(ConfigurationError, match=r"every setting once, got 'trainer.learning_rate' 2 times"):
         parse_space([RATE, RATE], base)
 
 
-def test_every_kind_gives_values_and_words_that_compose(base: DictConfig) -> None:
+def test_every_kind_gives_values_and_words_that_compose(base: TrainSettings) -> None:
     space = parse_space(
         [
             RATE,
@@ -92,9 +91,8 @@ def test_every_kind_gives_values_and_words_that_compose(base: DictConfig) -> Non
         study.tell(trial, 0.0)
     assert seen == {"None", "0.1", "[2, 3]", "[4, 5]"}
     cfg = compose(TrainSettings, ["object=brick", "experiment=smoke", *(s.word(values[s.name]) for s in space)])
-    assert {
-        s.name: OmegaConf.to_container(OmegaConf.create([OmegaConf.select(cfg, s.name)]))[0] for s in space
-    } == values
+    plain = dict(leaves(cfg.composed))
+    assert {s.name: plain[s.name] for s in space} == values
     stored = study.trials[-1].params
     assert {s.name: s.value(stored[s.name]) for s in space} == values
 
@@ -102,6 +100,6 @@ def test_every_kind_gives_values_and_words_that_compose(base: DictConfig) -> Non
 @pytest.mark.parametrize("name", choices("sweep"))
 def test_the_spaces_of_conf_fit_the_preset_of_their_name(name: str) -> None:
     assert (CONF / "experiment" / f"{name}.yaml").is_file()
-    space = OmegaConf.to_container(compose(SweepSettings, ["object=brick", f"sweep={name}"]).sweep.space)
+    space = compose(SweepSettings, ["object=brick", f"sweep={name}"]).sweep.space
     assert isinstance(space, list)
     assert len(parse_space(space, compose(TrainSettings, ["object=brick", f"experiment={name}"]))) == len(space)

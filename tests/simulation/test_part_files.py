@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.setting import Target
 from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
 from attentionvote.simulation.mesh import write_surface
 from attentionvote.simulation.part_files import load_part
@@ -18,14 +18,14 @@ from attentionvote.simulation.part_files import load_part
 FROM_DATASETS = {"bunny": 0.234355236, "tless_20": 0.107, "tless_22": 0.108, "tless_29": 0.135}
 
 
-def configured(repository: Path, name: str) -> object:
+def configured(repository: Path, name: str) -> Target:
     with initialize_config_dir(str(repository / "conf"), version_base=None):
-        return compose(f"object/{name}").object
+        return Target.of(OmegaConf.to_container(compose(f"object/{name}").object, resolve=True))
 
 
 @pytest.mark.parametrize("name", BUILTIN_PARTS)
 def test_the_configuration_of_a_builtin_says_what_the_catalogue_says(repository: Path, name: str) -> None:
-    part = instantiate(configured(repository, name))
+    part = configured(repository, name)()
     assert (part.name, part.title) == (name, BUILTIN_PARTS[name].title)
     assert part.diameter == BUILTIN_PARTS[name].diameter
     assert part.symmetry == BUILTIN_PARTS[name].symmetry
@@ -38,11 +38,10 @@ def test_a_dataset_part_without_its_mesh_says_where_it_belongs(
 ) -> None:
     monkeypatch.setenv("ATTENTIONVOTE_DATA", str(tmp_path))
     config = configured(repository, name)
-    assert config.diameter == diameter  # type: ignore[attr-defined]
+    assert config.arguments["diameter"] == diameter
     pattern = rf"mesh of object '{name}', .*Siléane.*, must be at '{tmp_path}/meshes/\w+\.\w+', which does not exist"
-    with pytest.raises(InstantiationException, match=pattern) as caught:
-        instantiate(config)
-    assert isinstance(caught.value.__cause__, FileNotFoundError)
+    with pytest.raises(FileNotFoundError, match=pattern):
+        config()
 
 
 def test_a_file_gets_the_configured_diameter_and_symmetry(tmp_path: Path) -> None:

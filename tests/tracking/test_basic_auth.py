@@ -21,6 +21,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
 from attentionvote.tracking.store import connect, experiment_id
+from attentionvote.workflows.train.settings import TrainSettings
 
 pytestmark = pytest.mark.slow
 MODEL = "attentionvote-bracket"

@@ -64,7 +64,7 @@ class Slurm:
         str, Setting("slurm, or local: processes of this machine, to rehearse.", choices=("slurm", "local"))
     ]
     minutes: Annotated[int, Setting("Limit of one element of the job array.", low=1, high=1_000_000)]
-    memory_gb: Annotated[float | None, Setting("Limit; null = the partition's default.", above=0, high=1e6)]
+    memory_gb: Annotated[float | None, Setting("Limit; null = the partition's default.", above=0, high=100_000)]
     partition: Annotated[str | None, Setting("null = the default.")]
     account: Annotated[str | None, Setting("null = the default.")]
 

@@ -21,6 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
+from attentionvote.files import cache_folder
+
 # Never -ffast-math: in a shared object it makes GCC flush subnormals to zero in the whole process. The running
 # maxima vectorise only under -ffinite-math-only (speed reference, "own C operators").
 PORTABLE = ("-O3", "-std=gnu99", "-ffinite-math-only", "-fno-signed-zeros", "-shared", "-fPIC")
@@ -117,18 +119,6 @@ def call(function: ctypes._NamedFuncPointer, *arguments: object) -> bool:
 def long(value: int) -> ctypes.c_int64:
     """A 64-bit argument; plain integers are passed as 32-bit ones."""
     return ctypes.c_int64(value)
-
-
-def cache_folder() -> Path:
-    """Where things computed once per machine are kept: ``ATTENTIONVOTE_CACHE``, else the user's cache folder."""
-    if named := os.environ.get("ATTENTIONVOTE_CACHE"):
-        return Path(named)
-    if named := os.environ.get("XDG_CACHE_HOME"):
-        return Path(named) / "attentionvote"
-    try:
-        return Path.home() / ".cache" / "attentionvote"
-    except RuntimeError:  # a user without a home; libraries are loaded from nowhere that others may write to
-        return Path(f"/run/user/{os.getuid()}/attentionvote")
 
 
 def _processor() -> str:

@@ -11,16 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.files import cache_folder
 from attentionvote.part import Part
 
 log = logging.getLogger(__name__)
 
 Hulls = tuple[NDArray[np.float64], ...]
-
-
-def cache_directory() -> Path:
-    """Where derived data of parts is kept: ``$ATTENTIONVOTE_CACHE``, else ``~/.cache/attentionvote``."""
-    return Path(os.environ.get("ATTENTIONVOTE_CACHE") or Path.home() / ".cache" / "attentionvote")
 
 
 def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cache: Path | None = None) -> Hulls:
@@ -30,7 +26,7 @@ def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cac
         part: the part; its surface is the cache key, with both settings and coacd's version.
         threshold: coacd's concavity threshold. 0.1 gives 8-10 pieces, and piles no worse than 0.02 does.
         max_vertices: most vertices of one piece.
-        cache: cache directory, default :func:`cache_directory`.
+        cache: cache directory, default ``files.cache_folder``.
 
     Returns:
         One ``(V, 3)`` float64 array per piece, a few seconds the first time, then read from the cache.
@@ -44,7 +40,7 @@ def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cac
         raise ValueError(f"hull threshold must lie in 0.01..1 (coacd's range), got {threshold}")
     if not 8 <= max_vertices <= 256:
         raise ValueError(f"hull vertices must lie in 8..256, got {max_vertices}")
-    path = hull_file(part, threshold, max_vertices, cache or cache_directory())
+    path = hull_file(part, threshold, max_vertices, cache or cache_folder())
     if path.is_file():
         with np.load(path) as stored:
             return tuple(stored[f"hull_{i:03d}"] for i in range(len(stored.files)))

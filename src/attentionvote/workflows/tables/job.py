@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml  # type: ignore[import-untyped]
+
 from attentionvote.command.conf_folder import CONF
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import configuring
@@ -114,13 +116,10 @@ def _measure(cfg: TablesSettings, words: Sequence[str], row: Row, name: str) -> 
 
 def record(cfg: TablesSettings, objects: Sequence[str]) -> dict[str, Any]:
     """Generate the frozen scenes of these parts and write their digests into ``RECORDED``; no mesh, no scenes."""
-
-    from omegaconf import OmegaConf
-
     from attentionvote.files import write_whole
     from attentionvote.workflows.evaluate.frozen_set import generated_set, set_spec
 
-    content: Any = OmegaConf.load(RECORDED)
+    content = yaml.safe_load(RECORDED.read_text(encoding="utf-8"))
     frozen = dict(content.get("frozen", {}))
     for name in objects:
         own = compose(EvaluateSettings, [f"object={name}", f"root={cfg.root}", "evaluation=benchmark", *cfg.evaluate])
@@ -132,9 +131,9 @@ def record(cfg: TablesSettings, objects: Sequence[str]) -> dict[str, Any]:
             continue
         frozen[name] = generated_set(own, part, set_spec(own, part)).scenes.digest
     head = "".join(line for line in RECORDED.read_text().splitlines(True) if line.startswith("#"))
-    content.frozen = dict(sorted(frozen.items()))
-    write_whole(RECORDED, head + OmegaConf.to_yaml(content))
-    return {"stage": "benchmark", "frozen": dict(content.frozen), "file": str(RECORDED)}
+    content["frozen"] = dict(sorted(frozen.items()))
+    write_whole(RECORDED, head + yaml.safe_dump(content, sort_keys=False))
+    return {"stage": "benchmark", "frozen": content["frozen"], "file": str(RECORDED)}
 
 
 def table_name(words: Sequence[str]) -> str:
