@@ -72,7 +72,11 @@ class Setting:
             names = self.choices.shipped if isinstance(self.choices, ChoicesOf) else self.choices
             return f"one of {', '.join(names)}"
         bounds = (("greater than", self.above), ("at least", self.low), ("at most", self.high))
-        return " and ".join(f"{text} {bound:g}" for text, bound in bounds if math.isfinite(bound))
+        return " and ".join(f"{text} {_number(bound)}" for text, bound in bounds if math.isfinite(bound))
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if float(value).is_integer() else f"{value:g}"
 
 
 class Field(NamedTuple):

@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 
 import pytest
-from hydra.errors import InstantiationException
 
 from attentionvote.command.entry import configuring
 from attentionvote.command.errors import ConfigurationError
@@ -170,8 +169,7 @@ def test_every_verb_answers_help_and_a_misspelt_word_at_once(name: str, tmp_path
 def test_configuring_turns_expected_errors_into_configuration_errors() -> None:
     with pytest.raises(ConfigurationError, match=r"^object gear: no mesh$"), configuring("object gear"):
         raise ValueError("no mesh")
-    cause = TypeError("unexpected keyword argument 'lrr'")
     with pytest.raises(ConfigurationError, match="lrr"), configuring():
-        raise InstantiationException("Error in call to target") from cause
+        raise TypeError("unexpected keyword argument 'lrr'")
     with pytest.raises(ZeroDivisionError), configuring():
         raise ZeroDivisionError

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 from attentionvote.contract import ModelCard
-from attentionvote.evaluation.bootstrap import interval
 from attentionvote.export.parity_record import Limits, Parity
 from attentionvote.setting import Setting, check
 
@@ -124,6 +123,8 @@ def judge(
 
 
 def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
+    from attentionvote.evaluation.bootstrap import interval  # scipy: not for a verb's help
+
     for name, floor in floors.items():
         value = candidate.figures.get(name)
         demands = f"{name} at least {floor:g}"
@@ -138,6 +139,8 @@ def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
 
 
 def _not_worse(margins: Mapping[str, float], candidate: Evidence, champion: Evidence) -> Iterator[Gate]:
+    from attentionvote.evaluation.bootstrap import interval  # scipy: not for a verb's help
+
     for name, margin in margins.items():
         demands = f"{name} at most {margin:g} below the champion's"
         if name not in candidate.draws or name not in champion.draws:
