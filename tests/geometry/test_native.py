@@ -31,6 +31,20 @@ def test_a_library_is_compiled_once_and_kept(empty_cache: Path) -> None:
     assert kept.stat().st_mtime_ns == changed
 
 
+def test_another_processor_has_a_library_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def made(tuned: bool) -> tuple[Path, tuple[str, ...]]:
+        return native._library("attentionvote.model", "pooled_mlp.c", tuned)[:2]
+
+    monkeypatch.delenv("ATTENTIONVOTE_MARCH", raising=False)
+    portable, (own, flags) = made(False), made(True)
+    assert flags[-1] == "-march=native"
+    monkeypatch.setenv("ATTENTIONVOTE_MARCH", "x86-64")
+    other, flags = made(True)
+    assert flags[-1] == "-march=x86-64"
+    assert other != own
+    assert made(False) == portable  # what a cell runs is the same on every processor
+
+
 def test_a_library_made_elsewhere_needs_neither_compiler_nor_a_writable_folder(
     empty_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

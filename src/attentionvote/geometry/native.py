@@ -81,7 +81,9 @@ def compiled(package: str, file: str, tuned: bool) -> ctypes.CDLL | None:
 
 def _library(package: str, file: str, tuned: bool) -> tuple[Path, tuple[str, ...], bytes]:
     """Where a C file's library is kept, how it is compiled, and its source."""
-    flags = (*PORTABLE, "-march=native") if tuned else PORTABLE
+    # ATTENTIONVOTE_MARCH names another processor than this one, to see what depends on it: x86-64 has no AVX. The flags
+    # are part of the key, so each has a library of its own.
+    flags = (*PORTABLE, f"-march={os.environ.get('ATTENTIONVOTE_MARCH') or 'native'}") if tuned else PORTABLE
     source = resources.files(package).joinpath(file).read_bytes()
     machine = _processor() if tuned else platform.machine()
     key = hashlib.sha256("\0".join([source.decode(), *flags, machine]).encode()).hexdigest()
