@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import warm_starter
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
@@ -145,7 +145,7 @@ def export(make_metadata: Callable[..., dict[str, Any]]) -> Callable[..., bytes]
         text.write_text(card.to_json(), encoding="utf-8")
         environment = os.environ | ({"PYTHONPATH": str(source)} if source else {})
         command = [sys.executable, str(Path(__file__).with_name("export_script.py")), str(model), str(text), str(out)]
-        subprocess.run(command, check=True, timeout=280, env=environment, capture_output=True)
+        warm_starter.run(command, check=True, timeout=280, env=environment, capture_output=True)
         return out.read_bytes()
 
     return run

@@ -5,7 +5,6 @@ Training a few steps is cheap: every combination does. Tracing is not: every cho
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+import warm_starter
 
 from attentionvote.contract import ModelCard
 from attentionvote.data.samples import Batch, collate, draw_sample
@@ -117,7 +117,7 @@ def graphs(
         (folder / files[1]).write_text(cards[-1].to_json(), encoding="utf-8")
         words += files
     command = [sys.executable, str(Path(__file__).with_name("export_script.py").resolve()), *words]
-    done = subprocess.run(command, cwd=folder, timeout=280, capture_output=True, text=True, check=False)
+    done = warm_starter.run(command, cwd=folder, timeout=280, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     networks = [load_trained(folder / name)[0] for name in words[::3]]
     content = [(folder / name).read_bytes() for name in words[2::3]]

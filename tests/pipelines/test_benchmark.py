@@ -11,6 +11,7 @@ from typing import Any
 
 import benchmark
 import pytest
+import warm_starter
 from configuration import ConfigurationError, compose
 from export_job import ExportJob
 from json_files import write_json
@@ -28,7 +29,7 @@ PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "pag
 def run(tmp_path: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The verb in a process of its own."""
     command = [sys.executable, ROOT / "pipelines" / "benchmark.py", *PLACES, *FEW, *words]
-    return subprocess.run(
+    return warm_starter.run(
         command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path, env=os.environ | environment
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import warm_starter
 from configuration import compose
 from hydra.utils import instantiate
 from several_parts import described, network_arguments
@@ -39,7 +39,7 @@ def python(script: str, *words: str, folder: Path) -> dict[str, Any]:
     """What a pipeline in a process of its own answers, with keys in ``folder``."""
     environment = os.environ | {"ATTENTIONVOTE_KEYS": str(folder / "keys")}
     command = [sys.executable, str(ROOT / "pipelines" / script), *words]
-    done = subprocess.run(
+    done = warm_starter.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1500, check=False
     )
     assert done.returncode == 0, done.stderr

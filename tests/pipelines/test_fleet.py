@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import fleet
 import fleet_board
 import pytest
+import warm_starter
 from configuration import ConfigurationError, compose
 from export_job import ExportJob
 from json_files import write_json
@@ -209,7 +209,7 @@ def test_a_fleet_goes_on_with_the_real_verbs_and_one_part_fails(export_brick: An
     ExportJob.find(compose("export", ["object=brick", "scenes=32"])).finish(bundle, {})
     (tmp_path / "data" / "scenes").mkdir(parents=True)
     (tmp_path / "data" / "scenes" / "gear").touch()
-    done = subprocess.run(
+    done = warm_starter.run(
         [sys.executable, ROOT / "pipelines" / "fleet.py", *words],
         capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path,
     )  # fmt: skip

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+import warm_starter
 
 from attentionvote import tracking
 from attentionvote.tracking.run import status_of
@@ -116,7 +117,7 @@ def test_killed_process_leaves_a_run_that_says_so_and_can_be_resumed(store, clie
         "print(run.id, flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", code, store]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ}) as process:
+    with warm_starter.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ}) as process:
         assert process.stdout is not None
         run_id = process.stdout.readline().strip()
         process.send_signal(number)
