@@ -139,9 +139,11 @@ def card(part: Part, network: AttentionVote) -> ModelCard:
 def export(make_metadata: Callable[..., dict[str, Any]]) -> Callable[..., bytes]:
     """Export a network with a card in a process of its own; ``source`` is the folder of the package."""
 
-    def run(network: AttentionVote, card: ModelCard, folder: Path, source: Path | None = None) -> bytes:
+    def run(
+        network: AttentionVote, card: ModelCard, folder: Path, source: Path | None = None, **metadata: Any
+    ) -> bytes:
         model, text, out = folder / "model.ckpt", folder / "card.json", folder / "model.onnx"
-        save_trained(network, make_metadata(), model)
+        save_trained(network, make_metadata(**metadata), model)
         text.write_text(card.to_json(), encoding="utf-8")
         environment = os.environ | ({"PYTHONPATH": str(source)} if source else {})
         command = [sys.executable, str(Path(__file__).with_name("export_script.py")), str(model), str(text), str(out)]

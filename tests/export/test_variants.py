@@ -15,6 +15,7 @@ import pytest
 import torch
 import warm_starter
 
+import attentionvote
 from attentionvote.contract import ModelCard
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.export import model_card
@@ -139,6 +140,19 @@ def test_a_trained_variants_graph_is_the_network(graphs: Graphs, part: Part, nam
             assert len(set(np.round(expected.confidence[0].numpy(), 4))) > 2
             for output, value in expected._asdict().items():
                 np.testing.assert_allclose(actual[output], value.numpy(), rtol=1e-4, atol=3e-5, err_msg=output)
+
+
+@pytest.mark.slow
+def test_the_same_weights_give_the_same_bytes_from_another_checkout(
+    graphs: Graphs, make_metadata: Callable[..., dict[str, Any]], export: Callable[..., bytes], tmp_path: Path
+) -> None:
+    """In a process of its own; here it was the first of several. The smallest network there is: a trace is dear."""
+    name = next(iter(EXPORTED))
+    network, card, graph = graphs[name]
+    source = tmp_path / "elsewhere" / "src"
+    shutil.copytree(Path(attentionvote.__file__).parent, source / "attentionvote")
+    arguments = make_metadata()["model"] | SMALL | EXPORTED[name]
+    assert export(network, card, tmp_path, source, points=POINTS, model=arguments) == graph
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ NETWORK = [
     "model.centers=[64,32,16,8]", "model.neighbors=[16,8,8,4]", "model.widths=[[8,16],[16,16],[16,16],[16,16]]",
     "model.propagation=[16,16]", "model.voting=[16]", "model.fusion=[16,16]", "model.head=[16]", "model.proposals=8",
     "model.gathered=8", "model.refinement.points=24", "model.refinement.widths=[8,16]", "model.refinement.head=[16]",
-    "model.voxel_fraction=0.2", "model.radius_fraction=0.2",
+    "model.voxel_fraction=0.2", "model.radius_fraction=0.2", "model.refinement_steps=1",
 ]  # fmt: skip
 NAMES = ("connecting_rod", "slider_bearing_pedestal")
 
