@@ -5,6 +5,7 @@ Training a few steps is cheap: every combination does. Tracing is not: every cho
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -60,7 +60,9 @@ def verb(tmp_path: Path) -> Path:
     return script
 
 
-def call(script: Path, *words: str, start: Callable[..., Any] = subprocess.run) -> subprocess.CompletedProcess[str]:
+def call(
+    script: Path, *words: str, start: Callable[..., subprocess.CompletedProcess[str]] = subprocess.run
+) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(script), *words]
     return start(command, cwd=script.parent, capture_output=True, text=True, timeout=100, check=False)
 
