@@ -12,6 +12,7 @@ from typing import Any
 
 import benchmark
 import pytest
+import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -34,7 +35,7 @@ PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "pag
 def run(tmp_path: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The verb in a process of its own."""
     command = [sys.executable, ROOT / "pipelines" / "benchmark.py", *PLACES, *FEW, *words]
-    return subprocess.run(
+    return warm_starter.run(
         command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path, env=os.environ | environment
     )
 

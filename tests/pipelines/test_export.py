@@ -59,7 +59,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "propagation": [16, 16], "residual": True, "radius_fraction": 0.2, "voxel_fraction": 0.2, "voting": [16],
         "proposals": 8, "gathered": 8, "fusion": [16, 16], "head": [16], "rotation": "six", "confidence": "quality",
         "center_seed": "mean", "vote_rotation": True, "merge_fraction": 0.08,
-        "refinement": {"points": 24, "widths": [8, 16], "head": [16]},
+        "refinement": {"points": 24, "widths": [8, 16], "head": [16]}, "refinement_steps": 1,
     }  # fmt: skip
     torch.manual_seed(0)
     scenes = SceneSet.open(next((folder / "data" / "scenes" / "brick").glob("test-*")))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any
 
 import fleet
 import pytest
+import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -214,7 +214,7 @@ def test_a_fleet_goes_on_with_the_real_verbs_and_one_part_fails(export_brick: An
     ExportJob.find(compose(ExportSettings, ["object=brick", "scenes=32"])).finish(bundle, {})
     (tmp_path / "data" / "scenes").mkdir(parents=True)
     (tmp_path / "data" / "scenes" / "gear").touch()
-    done = subprocess.run(
+    done = warm_starter.run(
         [sys.executable, ROOT / "pipelines" / "fleet.py", *words],
         capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path,
     )  # fmt: skip
