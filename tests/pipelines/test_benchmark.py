@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import benchmark
 import pytest
 import warm_starter
 
@@ -21,6 +20,7 @@ from attentionvote.inference import load_bundle
 from attentionvote.workflows.evaluate.settings import EvaluateSettings
 from attentionvote.workflows.export import ExportJob
 from attentionvote.workflows.settings import ExportSettings
+from attentionvote.workflows.tables import job as benchmark
 from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fleet
 import pytest
 import warm_starter
 
@@ -26,6 +25,7 @@ from attentionvote.simulation.scene_set import generate_scene_set
 from attentionvote.simulation.scene_spec import scene_set_directory
 from attentionvote.workflows.export import ExportJob
 from attentionvote.workflows.fleet import board as fleet_board
+from attentionvote.workflows.fleet import job as fleet
 from attentionvote.workflows.fleet.settings import FleetSettings
 from attentionvote.workflows.settings import ExportSettings
 from attentionvote.workflows.train.job import find_training

@@ -168,7 +168,7 @@ def test_a_study_that_has_its_total_is_reported_without_a_worker(words: list[str
     ("more", "message"),
     [
         ("trails=3", "there is no setting 'trails', did you mean 'trials'?"),
-        ("trials=0", "trials must be at least 1; got 0"),
+        ("trials=0", "trials must be at least 1 and at most 1000000; got 0"),
         ("sweep=smok", "sweep must be one of compact, smoke; got 'smok', did you mean 'smoke'?"),
         ("sweep.pruner.kind=medain", "sweep.pruner.kind must be one of .*; got 'medain', did you mean 'median'?"),
         ("trainer.validate_every=9", "trainer.max_epochs must be at least trainer.validate_every"),

@@ -120,7 +120,7 @@ def leftovers(folder: Path) -> list[str]:
         (["object=bric"], "object must be one of .*; got 'bric', did you mean 'brick'?"),
         (["object=brick", "trainer.max_epoch=3"], "no setting 'trainer.max_epoch', did you mean 'trainer.max_epochs'?"),
         (["object=brick", "trainer.learning_rate=abc"], "trainer.learning_rate must be .* number .*; got 'abc'"),
-        (["object=brick", "trainer.batch_size=-4"], "trainer.batch_size must be at least 1; got -4"),
+        (["object=brick", "trainer.batch_size=-4"], "trainer.batch_size must be at least 1 and at most 100000; got -4"),
         (
             ["object=brick", "experiment=smoke", "trainer.batch_size=13"],
             "trainer.batch_size must be at most the 12 training scenes, got 13",
