@@ -82,7 +82,7 @@ class PromotionJob:
             measured = self.evaluation.measure(bundles, frozen)
         report = described(self.evaluation, frozen, measured[0])
         show(report)
-        evidence = [self._evidence(one) for one in measured]
+        evidence = [self._evidence(measurement) for measurement in measured]
         origin = self.versions.origin(self.evaluation.bundle.card.run_id, self.evaluation.signer)
         gates = judge(
             self.rules, evidence[0], evidence[1] if champion else None, self.evaluation.bundle.card, origin, len(frozen)

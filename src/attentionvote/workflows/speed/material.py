@@ -85,12 +85,12 @@ class Material:
         """
         last = replace(self.cycle, drop_counts=self.cycle.drop_counts[-1:])
         self._scenes = generate_scene_set(self.part, last, self.folder / "scenes", progress=False)
-        found = list(self._scenes.records)
-        if not found:
+        records = list(self._scenes.records)
+        if not records:
             raise ValueError(
                 f"a bin must hold {last.drop_counts[-1]} parts of {self.part.name}, got fewer: choose another"
             )
-        return found
+        return records
 
     @property
     def record(self) -> SceneRecord:
