@@ -84,9 +84,7 @@ def pinhole(camera: Camera) -> PinholeCamera:
     return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def write_ipa(
-    folder: Path, caster: PartCaster, records: Sequence[SceneRecord], progress: Callable[[int], None]
-) -> None:
+def write_ipa(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], report: Callable[[int], None]) -> None:
     """Write scenes in the IPA layout.
 
     A cycle has one picture of its empty bin there, from which readers tell the parts. When the camera moves from scene
@@ -115,9 +113,7 @@ def write_ipa(
         report(done + 1)
 
 
-def write_bop(
-    folder: Path, caster: PartCaster, records: Sequence[SceneRecord], progress: Callable[[int], None]
-) -> None:
+def write_bop(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], report: Callable[[int], None]) -> None:
     """Write scenes as BOP: a scene a drop cycle, a picture a pile; object ids count from 1 in the set's order."""
 
     from attentionvote.datasets.bop_writer import BopSceneWriter
