@@ -66,7 +66,7 @@ def bricks(part: Part, layout: Layout, seed: int) -> Batch:
 def trained(part: Part, arguments: dict[str, Any], rotation: RotationLoss) -> AttentionVote:
     """The network after two steps, which every weight has felt."""
     torch.manual_seed(0)
-    model = AttentionVote(**arguments).train()
+    model = AttentionVote.from_arguments(arguments).train()
     weights = {"vote": 1.0, "center": 1.0, "rotation": 1.0, "confidence": 1.0, "refined": 1.0}
     loss = AttentionVoteLoss(part, weights, LossSettings(rotation, assignment=1.0, confidence=model.confidence))
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)

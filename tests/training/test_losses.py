@@ -310,10 +310,10 @@ def test_rows_per_scene_bounds_what_is_trained_on(
             "loss weights must be among vote, vote_rotation, center, rotation, semantic, confidence, refined, "
             "got a, centre",
         ),
-        (lambda _: LossSettings(rotation="euler"), "rotation loss must be one of metric, .*, got 'euler'"),
+        (lambda _: LossSettings(rotation="euler"), "rotation must be one of metric, .*; got 'euler'"),
         (
             lambda _: LossSettings(confidence="none"),
-            "confidence loss must be exponential or quality, got 'none'",
+            "confidence must be one of exponential, quality; got 'none'",
         ),
     ],
 )
