@@ -96,7 +96,7 @@ def test_every_combination_trains(
     model = trained(part, make_metadata()["model"] | SMALL | choices, rotation).eval()
     batch = bricks(part, model.layout, 9)
     with torch.no_grad():
-        answer = model(batch.points, batch.normals, batch.found)
+        answer = model(batch.points, batch.normals, batch.neighborhoods)
     assert all(value.isfinite().all() for value in answer)
     assert (answer.peak_heat > 0).any(1).all()
 

@@ -111,19 +111,19 @@ class Backbone(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        found: Neighborhoods,
+        neighborhoods: Neighborhoods,
     ) -> tuple[Float[Tensor, "batch seeds 3"], Float[Tensor, "batch seeds features"]]:
         """Positions and features of the seeds."""
         batch = torch.arange(len(points), device=points.device)[:, None]
-        ordered, ordered_normals = points[batch, found.order], normals[batch, found.order]
+        ordered, ordered_normals = points[batch, neighborhoods.order], normals[batch, neighborhoods.order]
         xyz, directions = points, normals
         features: Tensor | None = None
         levels: list[Tensor] = []
-        for layer, size, neighbors in zip(self.abstractions, self.layout.centers, found.neighbors, strict=True):
+        for layer, size, neighbors in zip(self.abstractions, self.layout.centers, neighborhoods.neighbors, strict=True):
             centers, center_normals = ordered[:, :size], ordered_normals[:, :size]
             features = layer(xyz, directions, features, centers, center_normals, neighbors)
             levels.append(features)
             xyz, directions = centers, center_normals
-        third = self.propagation_3(levels[3], levels[2], found.nearest[0], found.weights[0])
-        seeds = self.propagation_2(third, levels[1], found.nearest[1], found.weights[1])
+        third = self.propagation_3(levels[3], levels[2], neighborhoods.nearest[0], neighborhoods.weights[0])
+        seeds = self.propagation_2(third, levels[1], neighborhoods.nearest[1], neighborhoods.weights[1])
         return ordered[:, : self.layout.seeds], seeds

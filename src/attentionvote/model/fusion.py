@@ -1,4 +1,4 @@
-"""From gathered votes to one feature per proposal (paper section 3.3): the three modules of Table 8.
+"""Fusion of gathered votes into one feature a proposal (paper section 3.3): the three modules of Table 8.
 
 All take the locally normalised votes ``[z; g]``, z = (vote - centre seed) / voting radius, and share the first one's
 MLP for the instance features; they differ in how the votes of a proposal become one:

@@ -55,11 +55,11 @@ class _Interpolate(torch.autograd.Function):
         coarse, fine, nearest, weights = (t.contiguous() for t in (coarse, fine, nearest, weights))
         ctx.sizes = coarse.shape[1], fine.shape[1], coarse.shape[2], fine.shape[2]
         out = coarse.new_empty(*fine.shape[:2], coarse.shape[2] + fine.shape[2])
-        given, library = [t.numpy() for t in (coarse, fine, nearest, weights)], kernels(_FILE)
+        inputs, library = [t.numpy() for t in (coarse, fine, nearest, weights)], kernels(_FILE)
         assert library is not None
 
         def work(_: int, *samples: int) -> None:
-            native.call(library.interpolate, *given, *map(native.long, samples), *ctx.sizes, out.numpy())
+            native.call(library.interpolate, *inputs, *map(native.long, samples), *ctx.sizes, out.numpy())
 
         in_threads(len(coarse), work, least=1)
         ctx.save_for_backward(nearest, weights)
@@ -68,14 +68,14 @@ class _Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         nearest, weights = ctx.saved_tensors
-        batch, (below, rows, width, own) = len(weights), ctx.sizes
-        grad_coarse, grad_fine = weights.new_empty(batch, below, width), weights.new_empty(batch, rows, own)
-        given = [t.numpy() for t in (gradients[0].contiguous(), nearest, weights)]
+        batch, (below, rows, width, fine_width) = len(weights), ctx.sizes
+        grad_coarse, grad_fine = weights.new_empty(batch, below, width), weights.new_empty(batch, rows, fine_width)
+        inputs = [t.numpy() for t in (gradients[0].contiguous(), nearest, weights)]
         out, library = [t.numpy() for t in (grad_coarse, grad_fine)], kernels(_FILE)
         assert library is not None
 
         def work(_: int, *samples: int) -> None:
-            native.call(library.interpolate_backward, *given, *map(native.long, samples), *ctx.sizes, *out)
+            native.call(library.interpolate_backward, *inputs, *map(native.long, samples), *ctx.sizes, *out)
 
         in_threads(batch, work, least=1)
         return grad_coarse, grad_fine, None, None

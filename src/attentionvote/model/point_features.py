@@ -1,4 +1,4 @@
-"""What a centre is told about each neighbour: offset, normal, distance and point pair feature."""
+"""Features of a centre's neighbours: offset, normal, distance and point pair feature."""
 
 from __future__ import annotations
 

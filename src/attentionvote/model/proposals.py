@@ -107,11 +107,11 @@ class Heatmap(nn.Module):
             return heatmap_reference(votes, voxel_size, window)
         batch, count, _ = votes.shape
         heat, beaten, mean = torch.empty(batch, count), torch.empty(batch, count), torch.empty(batch, count, 3)
-        given, out = votes.detach().contiguous().numpy(), [t.numpy() for t in (heat, beaten, mean)]
+        inputs, out = votes.detach().contiguous().numpy(), [t.numpy() for t in (heat, beaten, mean)]
         settings = float(voxel_size), window, CENTER, SIDE, TIE
 
         def work(_: int, *samples: int) -> None:
-            native.call(library.heatmap, given, *map(native.long, samples), count, *settings, *out)
+            native.call(library.heatmap, inputs, *map(native.long, samples), count, *settings, *out)
 
         in_threads(batch, work, least=1)
         return heat, beaten, mean
@@ -135,10 +135,10 @@ def gather_votes_reference(
     inside = squared <= radius * radius
     nearest = squared.argmin(-1)
     rank, index = torch.topk(torch.where(inside, order, -squared), min(count, total), dim=-1)
-    found = (rank > 0).sum(-1, keepdim=True)
-    position = torch.arange(count, device=votes.device) % found.clamp(min=1)
+    inside_count = (rank > 0).sum(-1, keepdim=True)
+    position = torch.arange(count, device=votes.device) % inside_count.clamp(min=1)
     index = torch.take_along_dim(index, position, dim=-1)
-    return torch.where(found > 0, index, nearest[..., None])
+    return torch.where(inside_count > 0, index, nearest[..., None])
 
 
 def gather_votes(
@@ -153,11 +153,11 @@ def gather_votes(
         return gather_votes_reference(votes, center_seed, radius, count)
     batch, total, _ = votes.shape
     out = torch.empty(batch, center_seed.shape[1], count, dtype=torch.long)
-    given = [t.detach().contiguous().numpy() for t in (votes, center_seed)]
+    inputs = [t.detach().contiguous().numpy() for t in (votes, center_seed)]
     settings = total, center_seed.shape[1], radius * radius, count
 
     def work(_: int, *samples: int) -> None:
-        native.call(library.votes_around, *given, *map(native.long, samples), *settings, out.numpy())
+        native.call(library.votes_around, *inputs, *map(native.long, samples), *settings, out.numpy())
 
     in_threads(batch, work, least=1)
     return out

@@ -65,11 +65,11 @@ def usable_checkpoint(paths: Sequence[Path], shapes: Mapping[str, torch.Size]) -
             continue
         try:
             content = torch.load(path, map_location="cpu", weights_only=True)
-            found = {name: value.shape for name, value in content["state_dict"].items()}
+            stored_shapes = {name: value.shape for name, value in content["state_dict"].items()}
         except Exception as error:  # whatever torch says of a torn file: it cannot be used
             log.warning("checkpoint %s cannot be read (%s) and is passed over", path, type(error).__name__)
             continue
-        if found == dict(shapes):
+        if stored_shapes == dict(shapes):
             return path
         log.warning("checkpoint %s belongs to another network and is passed over", path)
     return None

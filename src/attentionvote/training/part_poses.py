@@ -28,7 +28,7 @@ class PartPoses:
     @classmethod
     def of(cls, part: Parts, isotropic: float = 0.0) -> PartPoses:
         """Those of a part or a set of parts, see ``SymmetricPose.of``."""
-        return cls(tuple(SymmetricPose.of(one, isotropic) for one in part.parts))
+        return cls(tuple(SymmetricPose.of(member, isotropic) for member in part.parts))
 
     def diameter(self, part: Int[Tensor, "*rows"], dtype: torch.dtype) -> Float[Tensor, "*rows"] | float:
         """D in metres of every row's part, in the precision of ``dtype``; one number where all are the same."""

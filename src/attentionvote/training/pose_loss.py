@@ -72,9 +72,9 @@ class SymmetricPose:
     ) -> Float[Tensor, " rows"]:
         """Square of the rotational distance in square metres, minimum over the symmetry group."""
         with full_precision(true.device):
-            own = self.like(predicted)
-            aims = true[:, None] @ (own.group @ own.representation)
-            return (predicted[:, None] @ own.representation - aims).square().sum((-2, -1)).amin(1)
+            tables = self.like(predicted)
+            aims = true[:, None] @ (tables.group @ tables.representation)
+            return (predicted[:, None] @ tables.representation - aims).square().sum((-2, -1)).amin(1)
 
     def distance(
         self,
@@ -102,11 +102,11 @@ class SymmetricPose:
             return (self.squared_turn(rotation, true) + (_TINY * self.diameter) ** 2).sqrt() / (0.1 * self.diameter)
         if kind not in get_args(RotationLoss):
             raise ValueError(f"rotation loss must be one of {', '.join(get_args(RotationLoss))}, got {kind!r}")
-        own = self.like(rotation)
-        if own.axis is not None:
+        tables = self.like(rotation)
+        if tables.axis is not None:
             with full_precision(true.device):
-                aims = torch.einsum("rij,gjk,k->rgi", true, own.group, own.axis)
-                axes = (rotation @ own.axis)[:, None]
+                aims = torch.einsum("rij,gjk,k->rgi", true, tables.group, tables.axis)
+                axes = (rotation @ tables.axis)[:, None]
                 return angle_between(axes, aims).amin(1)
         return quaternion_loss(kind, quaternion[:, None], self._equivalents(true)).amin(1)
 
