@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from attentionvote.command.entry import command
 from attentionvote.command.errors import ConfigurationError, Refused
+from attentionvote.workflows.check_data import as_data, show
 from attentionvote.workflows.settings import CheckDataSettings
-
-if TYPE_CHECKING:
-    from attentionvote.datasets.check import Report
 
 log = logging.getLogger("attentionvote.check_data")
 
@@ -57,48 +55,6 @@ def run(cfg: CheckDataSettings) -> dict[str, Any]:
         more = f" (and {len(errors) - 1} more, see above)" if len(errors) > 1 else ""
         raise Refused(f"{errors[0]}{more}", result)
     return result
-
-
-def as_data(report: Report) -> dict[str, Any]:
-    """A report as JSON has it."""
-    dataset = report.dataset
-    return {
-        "format": dataset.format,
-        "title": dataset.title,
-        "split": dataset.split,
-        "parts": list(dataset.parts),
-        "directory": str(dataset.directory),
-        "scenes": len(dataset.names),
-        "with_five_drops": report.scored,
-        "expected": report.expected,
-        "opened": report.opened,
-        "instances": report.instances,
-        "poses_looked_at": report.placement.looked_at,
-        "poses_off_their_points": report.placement.misplaced,
-        "errors": list(report.errors),
-        "warnings": [finding.sentence for finding in report.findings if finding.severity == "warning"],
-    }
-
-
-def show(reports: list[Report]) -> None:
-    """A table on stderr, and every finding under it."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for name in ("format", "dataset", "split"):
-        table.add_column(name, overflow="fold")
-    for name in ("scenes", ">= 5 drops", "expected", "opened", "parts", "off", "wrong"):
-        table.add_column(name, justify="right")
-    for report in reports:
-        dataset, placement = report.dataset, report.placement
-        counts = (len(dataset.names), report.scored, report.expected, report.opened, report.instances)
-        cells = ["-" if value is None else f"{value}" for value in (*counts, placement.misplaced, len(report.errors))]
-        table.add_row(dataset.format, dataset.title, dataset.split, *cells)
-    Console(stderr=True).print(table)
-    for report in reports:
-        for finding in report.findings:
-            (log.error if finding.severity == "error" else log.warning)("%s", finding.sentence)
 
 
 if __name__ == "__main__":

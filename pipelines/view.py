@@ -34,7 +34,8 @@ def run(cfg: ViewSettings) -> dict[str, Any]:
     if cfg.split not in specs:
         raise ConfigurationError(f"split must be one of {', '.join(specs)}; got {cfg.split!r}")
     spec, caster = specs[cfg.split], PartCaster(part)
-    record = find_record(part, caster, spec, scene_set_directory(Path(cfg.root), part.name, spec), cfg.scene)
+    with configuring():
+        record = find_record(part, caster, spec, scene_set_directory(Path(cfg.root), part.name, spec), cfg.scene)
     cloud = synthesize(record, caster, sensor, cfg.max_points, np.random.default_rng(record.scene_seed))
     files = write_view(
         Path(cfg.output) / f"{part.name}-{cfg.split}-{cfg.scene}-{cfg.sensor}", part, caster, record, cloud

@@ -15,7 +15,7 @@ from settings_of_verbs import settings_of
 from attentionvote.command.conf_folder import CONF, primary_groups
 from attentionvote.command.configuration import compose
 from attentionvote.part import Part, PartSet
-from attentionvote.setting import Target
+from attentionvote.section import Target
 
 FILES = sorted(CONF.rglob("*.yaml"))
 VERBS = [p.stem for p in FILES if p.parent == CONF]

@@ -15,13 +15,12 @@ import dataclasses
 import inspect
 import math
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
-_Section = TypeVar("_Section")
 _NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
 
 
@@ -125,189 +124,6 @@ def without_null(type_: Any) -> tuple[Any, bool]:
     return type_, type_ is Any
 
 
-def find(section: Any, key: str, values: Any = None) -> Field | None:
-    """The setting of a dotted key below a section; None where there is none.
-
-    Args:
-        section: a dataclass, or a function that a ``_target_`` names.
-        key: an index in brackets (``widths[0]``) is left aside; keys of a dict have the type of its values.
-        values: of the section, which tell the ``_target_`` of a section that has one.
-    """
-    field = Field(section, Setting(""), ...)
-    for name in key.split("."):
-        type_, _ = without_null(field.type)
-        inside = isinstance(values, Mapping)
-        if type_ is Target:
-            if not inside or "_target_" not in values:
-                return None
-            type_ = located(str(values["_target_"]))
-        values = values.get(name) if inside else None
-        if get_origin(type_) in (dict, Mapping):
-            field = Field(get_args(type_)[1], field.setting, ...)
-            continue
-        fields = fields_of(type_) if dataclasses.is_dataclass(type_) or inspect.isroutine(type_) else {}
-        if name.partition("[")[0] not in fields:
-            return None
-        field = fields[name.partition("[")[0]]
-    return field
-
-
-@dataclasses.dataclass(frozen=True)
-class Target:
-    """A section that names with ``_target_`` what it configures; calling it makes that.
-
-    Args:
-        path: dotted name of a class or function.
-        arguments: its keyword arguments, as the section has them.
-    """
-
-    path: str
-    arguments: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any], key: str = "") -> Target:
-        """A section of plain values, checked against the signature of its target.
-
-        Raises:
-            SettingError: as ``read``.
-        """
-        if "_target_" not in values:
-            raise SettingError(
-                f"{key or 'a section'} must have _target_, the dotted name of what it configures; got none"
-            )
-        # Other keys that begin with an underscore steer Hydra's own way of calling a target.
-        arguments = {str(name): item for name, item in values.items() if not str(name).startswith("_")}
-        path = str(values["_target_"])
-        _arguments(located(path), arguments, key)
-        return cls(path, arguments)
-
-    @property
-    def name(self) -> str:
-        """The argument ``name``."""
-        return str(self.arguments["name"])
-
-    def __call__(self) -> Any:
-        """What the section configures; errors are those of its target."""
-        return located(self.path)(**self.arguments)
-
-
-def located(path: str) -> Any:
-    """The class or function of a ``_target_``.
-
-    Raises:
-        SettingError: when there is none.
-    """
-    module, _, name = path.rpartition(".")
-    try:
-        target = getattr(import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingError(f"_target_ must be the dotted name of a class or function; got {path!r}: {error}") from error
-    if not callable(target):
-        raise SettingError(f"_target_ must be the dotted name of a class or function; got {path!r}")
-    return target
-
-
-def read(section: type[_Section], values: Mapping[str, Any], key: str = "") -> _Section:
-    """A section from plain values, in their order.
-
-    Args:
-        section: a dataclass.
-        values: of plain containers, as a configuration file has them.
-        key: dotted name of the section, for sentences.
-
-    Raises:
-        SettingError: the first setting that is unknown, missing, of another type or out of its range.
-    """
-    arguments = _arguments(section, values, key)
-    try:
-        return section(**arguments)
-    except SettingError:
-        raise
-    except ValueError as error:
-        raise SettingError(str(error)) from error
-
-
-def check_value(section: Any, key: str, value: Any) -> None:
-    """Refuse a value of one setting below a section; keys of no typed section pass.
-
-    Args:
-        section: a dataclass.
-        key: dotted name of the setting.
-        value: plain.
-
-    Raises:
-        SettingError: as ``read``.
-    """
-    field = find(section, key)
-    if field is not None:
-        _value(key, value, field.type, field.setting)
-
-
-def check(section: Any) -> None:
-    """Refuse a dataclass of settings, made in code, with a number, text or list out of its range.
-
-    Raises:
-        SettingError: as ``read``.
-    """
-    for name, field in fields_of(type(section)).items():
-        value = getattr(section, name)
-        if not dataclasses.is_dataclass(value):
-            _value(name, value, field.type, field.setting)
-
-
-def _arguments(section: Any, values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    fields = fields_of(section)
-    arguments = {}
-    for name, value in values.items():
-        inner = f"{key}.{name}" if key else name
-        if name not in fields:
-            close = get_close_matches(name, fields, n=1)
-            hint = f", did you mean {inner.removesuffix(name) + close[0]!r}?" if close else ""
-            raise SettingError(f"there is no setting {inner!r}{hint}")
-        field = fields[name]
-        arguments[name] = _value(inner, value, field.type, field.setting)
-    for name, field in fields.items():
-        if field.default is ... and name not in arguments:
-            raise SettingError(f"{key}.{name} must be given" if key else f"{name} must be given")
-    return arguments
-
-
-def _value(key: str, value: Any, type_: Any, setting: Setting) -> Any:
-    """The value as its type has it: sections as objects, lists as tuples."""
-    type_, nullable = without_null(type_)
-    if value is None:
-        if nullable:
-            return None
-        raise SettingError(f"{key} must be {_wanted(type_, setting, True)}; got null")
-    if type_ is Any:
-        return value
-    origin = get_origin(type_)
-    if dataclasses.is_dataclass(type_):
-        if not isinstance(value, Mapping):
-            raise SettingError(f"{key} must be a section{' or null' if nullable else ''}; got {value!r}")
-        if type_ is Target:
-            return Target.of(value, key)
-        return read(type_, value, key)  # type: ignore[arg-type]
-    if origin in (dict, Mapping):
-        if not isinstance(value, Mapping):
-            raise SettingError(f"{key} must be a section{' or null' if nullable else ''}; got {value!r}")
-        return {str(name): _value(f"{key}.{name}", item, get_args(type_)[1], setting) for name, item in value.items()}
-    if origin in (tuple, Sequence, list):
-        if isinstance(value, str) or not isinstance(value, Sequence):
-            raise SettingError(f"{key} must be a list{' or null' if nullable else ''}; got {value!r}")
-        inner = get_args(type_)
-        types_ = [inner[0]] * len(value) if len(inner) == 1 or inner[1] is ... else list(inner)
-        if len(types_) != len(value):
-            raise SettingError(f"{key} must be a list of {len(types_)}; got {list(value)}")
-        return tuple(_value(key, item, t, setting) for item, t in zip(value, types_, strict=True))
-    problem = scalar_problem(value, type_, setting, nullable)
-    if problem:
-        raise SettingError(f"{key} must be {problem}")
-    if setting.problem is not None and (problem := setting.problem(value)):
-        raise SettingError(f"{key} {problem}")
-    return value
-
-
 def scalar_problem(value: Any, type_: Any, setting: Setting, nullable: bool) -> str:
     """What a number, text or truth value should be and what it is, the end of a sentence; empty when it fits."""
     choices = get_args(type_) if get_origin(type_) is Literal else setting.choices
@@ -324,13 +140,13 @@ def scalar_problem(value: Any, type_: Any, setting: Setting, nullable: bool) -> 
         str: isinstance(value, str),
     }
     if not fits[type_]:
-        return f"{_wanted(type_, setting, True)}; got {value!r}"
+        return f"{wanted(type_, setting, True)}; got {value!r}"
     if not number or (math.isfinite(value) and setting.low <= value <= setting.high and value > setting.above):
         return ""
-    return f"{_wanted(type_, setting, nullable)}; got {value!r}"
+    return f"{wanted(type_, setting, nullable)}; got {value!r}"
 
 
-def _wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
+def wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
     """Type and range of a setting in words."""
     if not isinstance(type_, type) or type_ not in _NOUNS:
         return "a section" if dataclasses.is_dataclass(type_) else setting.range_text() or "a list"
@@ -344,14 +160,3 @@ def _wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
 def _near(name: str, valid: Collection[str]) -> str:
     close = get_close_matches(name, valid, n=1)
     return f", did you mean {close[0]!r}?" if close else ""
-
-
-def leaves(section: Any, key: str = "") -> Iterator[tuple[str, Field]]:
-    """Every setting below a section by its dotted key, depth first; a dict is one setting."""
-    for name, field in fields_of(section).items():
-        inner = f"{key}.{name}" if key else name
-        type_, _ = without_null(field.type)
-        if dataclasses.is_dataclass(type_) and type_ is not Target:
-            yield from leaves(type_, inner)
-        else:
-            yield inner, field

@@ -175,10 +175,10 @@ def test_opencv_keeps_its_threads(voted: PpfDetector, part: Part) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"sampling": 0.001}, "ppf sampling must lie in 0.02..0.2, got 0.001"),
-        ({"hypotheses": 0}, "ppf hypotheses must lie in 1..10000, got 0"),
-        ({"fit_distance": float("nan")}, "ppf fit_distance must lie in 0.001..0.5, got nan"),
-        ({"score": "vote"}, "ppf score must be one of votes, fit, got 'vote', did you mean 'votes'"),
+        ({"sampling": 0.001}, "^sampling must be at least 0.02 and at most 0.2; got 0.001"),
+        ({"hypotheses": 0}, "^hypotheses must be at least 1 and at most 10000; got 0"),
+        ({"fit_distance": float("nan")}, "^fit_distance must be at least 0.001 and at most 0.5; got nan"),
+        ({"score": "vote"}, "^score must be one of votes, fit; got 'vote', did you mean 'votes'"),
     ],
 )
 def test_impossible_settings_are_one_sentence(change: dict, sentence: str) -> None:

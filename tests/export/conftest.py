@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import warm_starter
 from numpy.typing import NDArray
 from tiny_network import EXPORT_CHANGES, TINY_ARGUMENTS, with_random_norms
 
@@ -112,13 +112,15 @@ def card(part: Part, network: AttentionVote) -> ModelCard:
 def export(make_metadata: Callable[..., dict[str, Any]]) -> Callable[..., bytes]:
     """Export a network with a card in a process of its own; ``source`` is the folder of the package."""
 
-    def run(network: AttentionVote, card: ModelCard, folder: Path, source: Path | None = None) -> bytes:
+    def run(
+        network: AttentionVote, card: ModelCard, folder: Path, source: Path | None = None, **metadata: Any
+    ) -> bytes:
         model, text, out = folder / "model.ckpt", folder / "card.json", folder / "model.onnx"
-        save_trained(network, make_metadata(), model)
+        save_trained(network, make_metadata(**metadata), model)
         text.write_text(card.to_json(), encoding="utf-8")
         environment = os.environ | ({"PYTHONPATH": str(source)} if source else {})
         command = [sys.executable, str(Path(__file__).with_name("export_script.py")), str(model), str(text), str(out)]
-        subprocess.run(command, check=True, timeout=280, env=environment, capture_output=True)
+        warm_starter.run(command, check=True, timeout=280, env=environment, capture_output=True)
         return out.read_bytes()
 
     return run

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils import _pytree as pytree
 
-from attentionvote.export import graph_layers
+from attentionvote.export import graph_layers, graph_scan
 from attentionvote.export.graph_folding import GraphNorm, GraphVoteBranch, folded
 from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.fusion import VoteBranch
@@ -25,17 +24,13 @@ CLOSE = {"atol": 2e-6, "rtol": 1e-5}
 
 @pytest.fixture(autouse=True)
 def several_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small steps, one after the other: torch's scan outside of a trace compiles for seconds."""
+    """Small steps, several of them."""
 
-    def scan(step: Callable[[Tensor, Any], tuple[Tensor, Any]], carry: Tensor, blocks: Any) -> tuple[Tensor, Any]:
-        answers = []
-        for number in range(len(pytree.tree_leaves(blocks)[0])):
-            carry, answer = step(carry, pytree.tree_map(lambda block, n=number: block[n], blocks))
-            answers.append(answer)
-        assert len(answers) > 1
-        return carry, pytree.tree_map(lambda *parts: torch.stack(parts), *answers)
+    def in_blocks(step: Callable[..., Sequence[Tensor]], blocks: Sequence[Tensor], shared: Any) -> list[Tensor]:
+        assert len(blocks[0]) > 1
+        return graph_scan.in_blocks(step, blocks, shared)
 
-    monkeypatch.setattr(graph_layers, "scan", scan)
+    monkeypatch.setattr(graph_layers, "in_blocks", in_blocks)
     for name, size in (("_ROWS", 64), ("_POSES", 3), ("_PAIRS", 1024)):
         monkeypatch.setattr(graph_layers, name, size)
     torch.manual_seed(3)

@@ -1,29 +1,15 @@
-"""The file: the same bytes from any checkout, its card inside, and what no exported file may be."""
+"""The file: its card inside, and what no exported file may be."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import onnx
 import pytest
 from onnx import TensorProto, helper
 
-import attentionvote
 from attentionvote.contract import CARD_KEY, LAYOUT_KEY, ModelCard, TensorSpec
 from attentionvote.export.onnx_file import OPSET, check_graph
-from attentionvote.model.network import AttentionVote
-
-
-@pytest.mark.slow
-def test_the_same_weights_give_the_same_bytes_from_another_checkout(
-    network: AttentionVote, card: ModelCard, graph: bytes, export: Callable[..., bytes], tmp_path: Path
-) -> None:
-    source = tmp_path / "elsewhere" / "src"
-    shutil.copytree(Path(attentionvote.__file__).parent, source / "attentionvote")
-    assert export(network, card, tmp_path, source) == graph
 
 
 @pytest.mark.slow

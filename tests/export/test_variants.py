@@ -5,7 +5,7 @@ Training a few steps is cheap: every combination does. Tracing is not: every cho
 
 from __future__ import annotations
 
-import subprocess
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,9 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+import warm_starter
 
+import attentionvote
 from attentionvote.contract import ModelCard
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.export.checkpoint_card import model_card
@@ -119,7 +121,7 @@ def graphs(
         (folder / files[1]).write_text(cards[-1].to_json(), encoding="utf-8")
         words += files
     command = [sys.executable, str(Path(__file__).with_name("export_script.py").resolve()), *words]
-    done = subprocess.run(command, cwd=folder, timeout=280, capture_output=True, text=True, check=False)
+    done = warm_starter.run(command, cwd=folder, timeout=280, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     networks = [load_trained(folder / name)[0] for name in words[::3]]
     content = [(folder / name).read_bytes() for name in words[2::3]]
@@ -141,6 +143,19 @@ def test_a_trained_variants_graph_is_the_network(graphs: Graphs, part: Part, nam
             assert len(set(np.round(expected.confidence[0].numpy(), 4))) > 2
             for output, value in expected._asdict().items():
                 np.testing.assert_allclose(actual[output], value.numpy(), rtol=1e-4, atol=3e-5, err_msg=output)
+
+
+@pytest.mark.slow
+def test_the_same_weights_give_the_same_bytes_from_another_checkout(
+    graphs: Graphs, make_metadata: Callable[..., dict[str, Any]], export: Callable[..., bytes], tmp_path: Path
+) -> None:
+    """In a process of its own; here it was the first of several. The smallest network there is: a trace is dear."""
+    name = next(iter(EXPORTED))
+    network, card, graph = graphs[name]
+    source = tmp_path / "elsewhere" / "src"
+    shutil.copytree(Path(attentionvote.__file__).parent, source / "attentionvote")
+    arguments = make_metadata()["model"] | SMALL | EXPORTED[name]
+    assert export(network, card, tmp_path, source, points=POINTS, model=arguments) == graph
 
 
 @pytest.mark.slow

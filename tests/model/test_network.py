@@ -19,7 +19,7 @@ from attentionvote.model.neighborhoods import find_neighborhoods
 from attentionvote.model.network import AttentionVote, PoseChannels
 from attentionvote.model.proposals import Peaks, gather_votes
 from attentionvote.model.settings import NetworkSettings
-from attentionvote.setting import read
+from attentionvote.section import read
 
 pytestmark = pytest.mark.usefixtures("kernels")
 

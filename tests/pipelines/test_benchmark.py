@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import benchmark
 import pytest
+import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -20,6 +20,7 @@ from attentionvote.inference import load_bundle
 from attentionvote.workflows.evaluate.settings import EvaluateSettings
 from attentionvote.workflows.export import ExportJob
 from attentionvote.workflows.settings import ExportSettings
+from attentionvote.workflows.tables import job as benchmark
 from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
@@ -34,7 +35,7 @@ PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "pag
 def run(tmp_path: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """The verb in a process of its own."""
     command = [sys.executable, ROOT / "pipelines" / "benchmark.py", *PLACES, *FEW, *words]
-    return subprocess.run(
+    return warm_starter.run(
         command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path, env=os.environ | environment
     )
 

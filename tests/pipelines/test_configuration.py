@@ -13,7 +13,8 @@ import pytest
 
 from attentionvote.command.configuration import VerbSettings, compose, leaves, type_problem
 from attentionvote.command.errors import ConfigurationError, nearest, sentence
-from attentionvote.setting import Setting, Target
+from attentionvote.section import Target
+from attentionvote.setting import Setting
 from attentionvote.workflows.train.settings import TrainSettings
 
 

@@ -55,7 +55,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     part = load_part("brick", "builtin:brick")
     box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
-    network = TINY_ARGUMENTS | EXPORT_CHANGES | {"diameter": float(part.diameter), "box": box}
+    network = TINY_ARGUMENTS | EXPORT_CHANGES | {"diameter": float(part.diameter), "box": box, "refinement_steps": 1}
     torch.manual_seed(0)
     scenes = SceneSet.open(next((folder / "data" / "scenes" / "brick").glob("test-*")))
     metadata = {

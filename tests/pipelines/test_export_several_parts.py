@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.evaluation.by_part import COUNTS
@@ -31,7 +31,7 @@ NETWORK = [
     "model.centers=[64,32,16,8]", "model.neighbors=[16,8,8,4]", "model.widths=[[8,16],[16,16],[16,16],[16,16]]",
     "model.propagation=[16,16]", "model.voting=[16]", "model.fusion=[16,16]", "model.head=[16]", "model.proposals=8",
     "model.gathered=8", "model.refinement.points=24", "model.refinement.widths=[8,16]", "model.refinement.head=[16]",
-    "model.voxel_fraction=0.2", "model.radius_fraction=0.2",
+    "model.voxel_fraction=0.2", "model.radius_fraction=0.2", "model.refinement_steps=1",
 ]  # fmt: skip
 NAMES = ("connecting_rod", "slider_bearing_pedestal")
 
@@ -40,7 +40,7 @@ def python(script: str, *words: str, folder: Path) -> dict[str, Any]:
     """What a pipeline in a process of its own answers, with keys in ``folder``."""
     environment = os.environ | {"ATTENTIONVOTE_KEYS": str(folder / "keys")}
     command = [sys.executable, str(ROOT / "pipelines" / script), *words]
-    done = subprocess.run(
+    done = warm_starter.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1500, check=False
     )
     assert done.returncode == 0, done.stderr

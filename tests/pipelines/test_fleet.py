@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fleet
 import pytest
+import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -26,6 +25,7 @@ from attentionvote.simulation.scene_set import generate_scene_set
 from attentionvote.simulation.scene_spec import scene_set_directory
 from attentionvote.workflows.export import ExportJob
 from attentionvote.workflows.fleet import board as fleet_board
+from attentionvote.workflows.fleet import job as fleet
 from attentionvote.workflows.fleet.settings import FleetSettings
 from attentionvote.workflows.settings import ExportSettings
 from attentionvote.workflows.train.job import find_training
@@ -214,7 +214,7 @@ def test_a_fleet_goes_on_with_the_real_verbs_and_one_part_fails(export_brick: An
     ExportJob.find(compose(ExportSettings, ["object=brick", "scenes=32"])).finish(bundle, {})
     (tmp_path / "data" / "scenes").mkdir(parents=True)
     (tmp_path / "data" / "scenes" / "gear").touch()
-    done = subprocess.run(
+    done = warm_starter.run(
         [sys.executable, ROOT / "pipelines" / "fleet.py", *words],
         capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path,
     )  # fmt: skip

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import warm_starter
 
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, resolve_store
@@ -71,9 +72,11 @@ def verb(tmp_path: Path) -> Path:
     return script
 
 
-def call(script: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def call(
+    script: Path, *words: str, start: Callable[..., subprocess.CompletedProcess[str]] = subprocess.run
+) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(script), *words]
-    return subprocess.run(command, cwd=script.parent, capture_output=True, text=True, timeout=100, check=False)
+    return start(command, cwd=script.parent, capture_output=True, text=True, timeout=100, check=False)
 
 
 def lines(done: subprocess.CompletedProcess[str]) -> list[dict]:
@@ -192,7 +195,7 @@ def test_runs_stand_below_one_parent_that_is_found_again(
         with start_run(store, part, system_interval_s=0) as run:
             (tmp_path / f"run-{part}").write_text(run.id)
     words = ["object=gear,brick", f"tracking.store={store}", "do=it"]
-    done = call(verb, "-m", *words)
+    done = call(verb, "-m", *words, start=warm_starter.run)
     assert done.returncode == 0, done.stderr
     client = connect(resolve_store(store))
     grids = client.get_experiment_by_name("grids").experiment_id
@@ -207,7 +210,7 @@ def test_runs_stand_below_one_parent_that_is_found_again(
     listed = json.loads(Path(client.download_artifacts(parent.info.run_id, "jobs.json", str(tmp_path))).read_text())
     assert [(job["run_id"], job["failed"]) for job in listed] == [(line["run_id"], None) for line in lines(done)]
     # Again, with jobs that fail now (what they make is there) and with another order: the same parent.
-    done = call(verb, "-m", "object=brick,gear", *words[1:])
+    done = call(verb, "-m", "object=brick,gear", *words[1:], start=warm_starter.run)
     assert done.returncode == 1
     (again,) = client.search_runs([grids])
     assert (again.info.run_id, again.info.status, again.data.tags["grid.failed"]) == (parent.info.run_id, "FAILED", "2")

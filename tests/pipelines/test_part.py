@@ -17,7 +17,7 @@ from attentionvote.command.conf_folder import CONF
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.setting import Target
+from attentionvote.section import Target
 from attentionvote.simulation.symmetry_detection import symmetry_residual
 from attentionvote.workflows.settings import PartSettings
 

@@ -15,6 +15,7 @@ import history
 import promote
 import pytest
 import rollback
+import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError, Refused
@@ -212,11 +213,11 @@ def test_of_two_processes_that_promote_at_once_exactly_one_wins(verb, model, sto
     for folder in folders:
         folder.mkdir()
     both = [
-        subprocess.Popen(
+        start(
             [*command, f"bundle='{digest[:12]}'"], cwd=tmp_path, env=dict(os.environ) | {"TMPDIR": str(folder)},
             text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )
-        for digest, folder in zip(digests, folders, strict=True)
+        for start, digest, folder in zip((warm_starter.Popen, subprocess.Popen), digests, folders, strict=True)
     ]  # fmt: skip
     wait_for_both(both, folders)
     ends = [process.communicate(timeout=200) for process in both]

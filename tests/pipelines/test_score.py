@@ -127,7 +127,7 @@ def test_the_settings_reach_the_figures(small: Path) -> None:
         (["frame=part"], "frame must be one of toolbox, object; got 'part'"),
         (["frame=object"], "Rref2i must be given, got only Lambda, G, distance_threshold"),
         (["threshold_scale=0.0"], "threshold_scale must be greater than 0 and at most 100; got 0.0"),
-        (["result_limit=0"], "result_limit must be a whole number at least 1; got 0"),
+        (["result_limit=0"], "result_limit must be a whole number at least 1 and at most 1000000; got 0"),
     ],
 )
 def test_impossible_requests_are_one_sentence(small: Path, change: list[str], text: str) -> None:

@@ -14,8 +14,9 @@ from settings_of_verbs import settings_of
 from attentionvote.command.conf_folder import CONF, SCRIPTS, choices, primary_groups
 from attentionvote.command.configuration import compose, leaves
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.setting import Field, SettingError, Target, check_value, find, without_null
-from attentionvote.setting import leaves as fields_below
+from attentionvote.section import Target, check_value, find
+from attentionvote.section import leaves as fields_below
+from attentionvote.setting import Field, SettingError, without_null
 from attentionvote.workflows.train.settings import TrainSettings
 
 VERBS = sorted(path.stem for path in CONF.glob("*.yaml"))

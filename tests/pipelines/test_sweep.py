@@ -14,6 +14,7 @@ from typing import Any
 import optuna
 import pytest
 import sweep
+import warm_starter
 from optuna.trial import TrialState
 
 from attentionvote.command.conf_folder import CONF
@@ -87,7 +88,7 @@ def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp
                 value=0.5 + 0.1 * index, params=params, distributions=distributions, intermediate_values={1: 0.9}
             )
         )
-    process = subprocess.Popen([*command, "trials=6", "workers=2"], cwd=ROOT, text=True, stdout=-1, stderr=-1)
+    process = warm_starter.Popen([*command, "trials=6", "workers=2"], cwd=ROOT, text=True, stdout=-1, stderr=-1)
     out, err = process.communicate(timeout=500)
     assert process.returncode == 0, err
     assert "Traceback" not in err
@@ -167,7 +168,7 @@ def test_a_study_that_has_its_total_is_reported_without_a_worker(words: list[str
     ("more", "message"),
     [
         ("trails=3", "there is no setting 'trails', did you mean 'trials'?"),
-        ("trials=0", "trials must be at least 1; got 0"),
+        ("trials=0", "trials must be at least 1 and at most 1000000; got 0"),
         ("sweep=smok", "sweep must be one of compact, smoke; got 'smok', did you mean 'smoke'?"),
         ("sweep.pruner.kind=medain", "sweep.pruner.kind must be one of .*; got 'medain', did you mean 'median'?"),
         ("trainer.validate_every=9", "trainer.max_epochs must be at least trainer.validate_every"),

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import torch
 import train
+import warm_starter
 from tiny_training import TINY_TRAINING
 
 from attentionvote.command.configuration import compose
@@ -80,9 +81,9 @@ def verb() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Starts ``make train``'s script; what still runs when the test ends is killed."""
     with ExitStack() as stack:
 
-        def start(words: list[str], **settings: Any) -> subprocess.Popen[str]:
+        def start(words: list[str], warm: bool = False, **settings: Any) -> subprocess.Popen[str]:
             process = stack.enter_context(
-                subprocess.Popen(
+                (warm_starter.Popen if warm else subprocess.Popen)(
                     [sys.executable, "pipelines/train.py", *words],
                     cwd=ROOT,
                     text=True,
@@ -119,7 +120,7 @@ def leftovers(folder: Path) -> list[str]:
         (["object=bric"], "object must be one of .*; got 'bric', did you mean 'brick'?"),
         (["object=brick", "trainer.max_epoch=3"], "no setting 'trainer.max_epoch', did you mean 'trainer.max_epochs'?"),
         (["object=brick", "trainer.learning_rate=abc"], "trainer.learning_rate must be .* number .*; got 'abc'"),
-        (["object=brick", "trainer.batch_size=-4"], "trainer.batch_size must be at least 1; got -4"),
+        (["object=brick", "trainer.batch_size=-4"], "trainer.batch_size must be at least 1 and at most 100000; got -4"),
         (
             ["object=brick", "experiment=smoke", "trainer.batch_size=13"],
             "trainer.batch_size must be at most the 12 training scenes, got 13",
@@ -307,7 +308,7 @@ def test_killed_anywhere_and_continued_ends_the_same(
     whole = run(words, f"outputs={tmp_path}/whole")
     killed_at = []
     for workers in (0, 1):  # in the middle of an epoch, with and without a loader process
-        process = verb([*words, f"data.workers={workers}"])
+        process = verb([*words, f"data.workers={workers}"], warm=bool(workers))
         last = tmp_path / "out" / "brick" / Path(whole["model"]).parent.name / "checkpoints" / "last.ckpt"
         before = last.stat().st_mtime_ns if last.exists() else 0
         until(process, lambda last=last, before=before: last.exists() and last.stat().st_mtime_ns > before)  # type: ignore[misc]

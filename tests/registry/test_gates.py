@@ -11,7 +11,7 @@ from attentionvote.export.parity_record import Limits, Parity
 from attentionvote.registry.gates import Evidence, Gate, Origin, Rules, judge
 
 LIMITS = Limits(0.1, 0.01, 0.1, 0.01, 0.01, 0.001, 0, 0.002, scenes=32)
-RULES = Rules({"ap_10": 0.9}, {"ap_10": 0.01}, latency_p95_ms=500.0, scenes=100, parity=LIMITS)
+RULES = Rules(100, {"ap_10": 0.9}, {"ap_10": 0.01}, latency_p95_ms=500.0, parity=LIMITS)
 PARITY = Parity(32, 100, 0, 0.0007, 0.0001, 0.0008, 0.0001, 0.0001, 0.0001, {"ap_10": (0.95, 0.95)})
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 ORIGIN = Origin(True, has_config=True, commits=(COMMIT,), has_changes=True, signed_by="feedfeedfeedfeed")

@@ -51,10 +51,10 @@ def test_without_jitter_the_camera_stands_over_the_middle() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Camera(fx=0), "camera fx must be positive, got 0"),
-        (lambda: Camera(width=-3), "camera width must be positive, got -3"),
-        (lambda: CameraSettings(distance=0), "camera distance must be positive metres, got 0"),
-        (lambda: CameraSettings(tilt_degrees=70), "camera tilt_degrees must lie in 0..60, got 70"),
+        (lambda: Camera(fx=0), "^fx must be greater than 0 and at most 1000000; got 0"),
+        (lambda: Camera(width=-3), "^width must be at least 8 and at most 16384; got -3"),
+        (lambda: CameraSettings(distance=0), "^distance must be a number greater than 0 and at most 100; got 0"),
+        (lambda: CameraSettings(tilt_degrees=70), "^tilt_degrees must be at least 0 and at most 60; got 70"),
     ],
 )
 def test_impossible_cameras(make: object, message: str) -> None:

@@ -134,13 +134,13 @@ def test_the_bin_grows_for_bulky_parts_only(bracket: Part) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: BinSettings(size=(0.3, 0.0, 0.1)), "bin size must be three positive lengths in metres"),
-        (lambda: BinSettings(jitter=0.6), "bin jitter must lie in 0..0.5, got 0.6"),
-        (lambda: DropSettings(timestep=0.02), "drop timestep must lie in 0.0001..0.01 seconds, got 0.02"),
+        (lambda: BinSettings(size=(0.3, 0.0, 0.1)), "^size must be .*greater than 0 and at most 100; got 0.0"),
+        (lambda: BinSettings(jitter=0.6), "^jitter must be at least 0 and at most 0.5; got 0.6"),
+        (lambda: DropSettings(timestep=0.02), "^timestep must be at least 0.0001 and at most 0.01; got 0.02"),
         (lambda: DropSettings(contact_time=0.007), r"drop contact_time must be at least two time steps \(0.008 s\)"),
         (lambda: DropSettings(friction=(0.6, 0.2)), "drop friction must be a range within 0..2"),
-        (lambda: DropSettings(speed=-1), "drop speed must lie in 0..5 m/s, got -1"),
-        (lambda: DropSettings(timeout=0.1), "drop timeout must lie in 0.25..30 seconds, got 0.1"),
+        (lambda: DropSettings(speed=-1), "^speed must be at least 0 and at most 5; got -1"),
+        (lambda: DropSettings(timeout=0.1), "^timeout must be greater than 0.25 and at most 30; got 0.1"),
     ],
 )
 def test_impossible_settings(make: object, message: str) -> None:

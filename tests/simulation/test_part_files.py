@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.setting import Target
+from attentionvote.section import Target
 from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
 from attentionvote.simulation.mesh import write_surface
 from attentionvote.simulation.part_files import load_part

@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 
 from attentionvote.part import Part
+from attentionvote.section import read
+from attentionvote.setting import SettingError
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop_settings import BinSettings, DropSettings
-from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
+from attentionvote.simulation.scene_spec import SceneSetSpec, SimulationSettings, scene_set_directory, scene_set_specs
 
 SPEC = SceneSetSpec("0" * 64, "train", 10)
 OTHERS = {
@@ -68,7 +70,7 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
         "drop": {"friction": [0.3, 0.3]},
         "visibility_stride": 4,
     }
-    specs = scene_set_specs(bracket, settings)
+    specs = scene_set_specs(bracket, read(SimulationSettings, settings))
     assert specs["test"] == SceneSetSpec(
         bracket.digest, "test", 2, 3, (2, 4), BinSettings(None, 0.1), CameraSettings(Camera(640, 480), 0.5),
         DropSettings(friction=(0.3, 0.3)), 4,
@@ -76,8 +78,8 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
     assert (specs["train"].cycles, set(specs)) == (5, {"train", "test"})
     assert settings["seed"] == 3
     assert settings["camera"]["camera"] == {"width": 640, "height": 480}  # type: ignore[index]
-    with pytest.raises(ValueError, match=r"simulation settings must have the keys of conf/simulation/default.yaml"):
-        scene_set_specs(bracket, settings | {"frcition": 1})
+    with pytest.raises(SettingError, match="^there is no setting 'dorp', did you mean 'drop'"):
+        read(SimulationSettings, settings | {"dorp": 1})
 
 
 @pytest.mark.parametrize(

@@ -196,13 +196,13 @@ def test_a_scene_outside_the_picture_is_empty(caster: PartCaster, scene_record: 
     [
         (
             {"preset": "fotoxi"},
-            "preset must be one of none, gaussian, phoxi, got 'fotoxi', did you mean 'phoxi'",
+            "preset must be one of none, gaussian, phoxi; got 'fotoxi', did you mean 'phoxi'",
         ),
         ({"preset": "gausian"}, "did you mean 'gaussian'"),
-        ({"sigma_mm": -1}, "sensor sigma_mm must lie in 0..100, got -1"),
-        ({"sigma_mm": float("nan")}, "sensor sigma_mm must lie in 0..100, got nan"),
-        ({"edge_jump": 0}, "sensor edge_jump must be positive metres, got 0"),
-        ({"dropout": 1.5}, r"sensor dropout must be a share in 0..1, got 1.5"),
+        ({"sigma_mm": -1}, "^sigma_mm must be at least 0 and at most 100; got -1"),
+        ({"sigma_mm": float("nan")}, "^sigma_mm must be at least 0 and at most 100; got nan"),
+        ({"edge_jump": 0}, "^edge_jump must be greater than 0 and at most 1; got 0"),
+        ({"dropout": 1.5}, r"^dropout must be at least 0 and at most 1; got 1.5"),
         ({"edge_dropout": 0.8, "edge_flying": 0.3}, r"edge_dropout \+ edge_flying must be at most 1, got 1.1"),
         ({"grazing_degrees": (80, 70)}, "sensor grazing_degrees must be a range within 0..90"),
     ],

@@ -1,9 +1,9 @@
 """The run above a group: one per digest, also when several processes ask at once; its children are adopted once."""
 
-import subprocess
 import sys
 
 import pytest
+import warm_starter
 
 from attentionvote.tracking.group_run import GROUP_TAG, adopt, open_group
 from attentionvote.tracking.run_opening import start_run
@@ -37,7 +37,7 @@ def test_two_processes_at_once_get_one_run(store):
         "sys.stdin.readline(); run = open_group(sys.argv[1], 'grids', 'g', 'race'); print(run.id); run.close()"
     )
     processes = [
-        subprocess.Popen([sys.executable, "-c", code, store], stdin=-1, stdout=-1, stderr=-1, text=True)
+        warm_starter.Popen([sys.executable, "-c", code, store], stdin=-1, stdout=-1, stderr=-1, text=True)
         for _ in range(2)
     ]
     for process in processes:

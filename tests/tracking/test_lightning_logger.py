@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import warm_starter
 
 from attentionvote.tracking.lightning_logger import RunLogger
 from attentionvote.tracking.run_opening import start_run
@@ -99,7 +100,7 @@ def test_end_of_fit_does_not_end_the_run(store, logger):
 @pytest.mark.slow
 def test_training_killed_and_started_again_is_one_run_with_contiguous_metrics(store, tmp_path):
     command = [sys.executable, str(SCRIPT), store, "-", str(tmp_path / "ckpt"), "1000"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with warm_starter.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         run_id = process.stdout.readline().strip()
         while process.stdout.readline().strip() not in ("5", ""):

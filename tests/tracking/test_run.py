@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+import warm_starter
 
 from attentionvote.tracking.run import status_of
 from attentionvote.tracking.run_opening import start_run
@@ -114,7 +115,7 @@ def test_killed_process_leaves_a_run_that_says_so_and_can_be_resumed(store, clie
         "print(run.id, flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", code, store]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ}) as process:
+    with warm_starter.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ}) as process:
         assert process.stdout is not None
         run_id = process.stdout.readline().strip()
         process.send_signal(number)

@@ -7,6 +7,7 @@ import traceback
 from collections import Counter
 
 import pytest
+import warm_starter
 
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
@@ -188,7 +189,7 @@ print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
 
 @pytest.mark.slow
 def test_processes_may_open_a_fresh_database_at_once(empty_database):
-    done = subprocess.run(
+    done = warm_starter.run(
         [sys.executable, "-c", RACE, empty_database], capture_output=True, text=True, timeout=200, check=False
     )
     assert done.stdout.strip() == "[0, 0, 0, 0]", done.stderr

@@ -55,7 +55,7 @@ def test_without_a_warm_up_everything_acts_from_the_first_step() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"shape": "linear"}, "shape must be one of step, cosine, constant; got 'linear'"),
+        ({"shape": "linear"}, "^shape must be one of step, cosine, constant; got 'linear'"),
         ({"milestones": [10, 5]}, r"milestones must be rising epochs, got \[10, 5\]"),
         ({"milestones": [5, 5]}, r"milestones must be rising epochs, got \[5, 5\]"),
     ],

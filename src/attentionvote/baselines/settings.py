@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 SCORES = ("votes", "fit")
 

@@ -30,7 +30,8 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 from attentionvote.command.conf_folder import CONF, choices, groups
 from attentionvote.command.errors import ConfigurationError, nearest, sentence
 from attentionvote.command.words import parse
-from attentionvote.setting import SettingError, find, read, without_null
+from attentionvote.section import find, read
+from attentionvote.setting import SettingError, without_null
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -11,7 +11,8 @@ from omegaconf import OmegaConf
 from attentionvote.command.conf_folder import choices, primary_groups
 from attentionvote.command.configuration import VerbSettings, compose, leaves
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.setting import Setting, find
+from attentionvote.section import find
+from attentionvote.setting import Setting
 
 
 def help_text(settings: type[VerbSettings], conf: Path) -> str:

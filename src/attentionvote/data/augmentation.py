@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.geometry.pose import rotation_about
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,23 @@
 """Layers of the network in the order of work that suits a CPU runtime: a few rows at a time, in the cache.
 
 Each does, for a batch of one, what the layer of ``model`` does that it stands for. Shared MLPs with their maximum, the
-view of the refinement and the heatmap go through a ``scan``, so that what they make on the way stays in the cache: the
+view of the refinement and the heatmap go through a ``Scan``, so that what they make on the way stays in the cache: the
 largest single gain of the exported graph. Points are gathered by rows but calculated with by planes, x and y and z
 apart, because sums over a last dimension of three are slow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch._higher_order_ops.scan import scan
 from torch.nn.functional import embedding, linear
 
 from attentionvote.export.graph_neighbors import farthest_point_order
+from attentionvote.export.graph_scan import in_blocks
 from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.farthest_votes import FarthestVotes
 from attentionvote.model.point_features import TINY
@@ -50,18 +52,19 @@ class GraphSetAbstraction(nn.Module):
         chunk = _divisor(count, _ROWS // near)
         cloud = torch.cat([xyz[0], normals[0]], dim=1)
         middles = torch.cat([centers[0], center_normals[0]], dim=1).view(-1, chunk, 6)
-        first, projected = _first_layer(weights[0], layer.radius), None
+        first, projected = _first_layer(weights[0], layer.radius), []
         if layer.project is not None and features is not None:
-            projected = layer.project(features[0])
+            projected = [layer.project(features[0])]
 
-        def step(carry: Tensor, block: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            middle, index = block
+        def step(block: Sequence[Tensor], shared: tuple[Tensor, Tensor, list[Tensor], list[Tensor]]) -> list[Tensor]:
+            (middle, index), (cloud, first, weights, projected) = block, shared
             hidden = linear(_pair_features(embedding(index, cloud), middle).T, first, weights[1])
-            if projected is not None:
-                hidden = hidden + embedding(index, projected)
-            return carry.clone(), _pooled(hidden, weights, chunk)
+            for features in projected:
+                hidden = hidden + embedding(index, features)
+            return [_pooled(hidden, weights, chunk)]
 
-        _, pooled = scan(step, torch.zeros(1), (middles, neighbors.view(-1, chunk * near)))
+        blocks = (middles, neighbors.view(-1, chunk * near))
+        (pooled,) = in_blocks(step, blocks, (cloud, first, weights, projected))
         return layer.finish(pooled.reshape(count, -1))[None]
 
 
@@ -120,23 +123,26 @@ class GraphRefiner(nn.Module):
         # First in index order = largest of a falling rank; 0 for a point outside.
         rank = torch.arange(total, 0, -1, dtype=torch.float32)
 
-        def step(carry: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            center, turn = poses
+        def step(poses: Sequence[Tensor], shared: tuple[dict[str, Tensor], list[Tensor]]) -> list[Tensor]:
+            (center, turn), (fixed, weights) = poses, shared
+            planes, rank, half = fixed["planes"], fixed["rank"], fixed["half"]
             # In units of the box around its middle: inside is what lies within one in every direction.
             away = planes - torch.cat([center, torch.zeros(chunk, 1)], dim=1)[:, :, None]
-            box_from_camera = torch.cat([turn.transpose(1, 2) / half[:, None], shift.expand(chunk, 3, 1)], dim=2)
+            shift = fixed["shift"].expand(chunk, 3, 1)
+            box_from_camera = torch.cat([turn.transpose(1, 2) / half[:, None], shift], dim=2)
             x, y, z = (box_from_camera @ away).abs().unbind(1)
             inside = torch.maximum(torch.maximum(x, y), z) <= 1
             inside_rank, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count, dim=1)
             number = (inside_rank > 0).sum(1, keepdim=True)
             index = torch.gather(index, 1, torch.arange(layer.points) % number.clamp(min=1))
             offset = torch.cat([center, torch.zeros_like(center)], dim=1)[:, None]
-            seen = (embedding(index, cloud) - offset).view(chunk, 2 * layer.points, 3) @ turn
-            seen = seen.view(chunk, layer.points, 6) * scale * (number > 0).to(seen.dtype)[:, None]
-            return carry.clone(), _pooled(linear(seen.view(-1, 6), weights[0], weights[1]), weights, chunk)
+            seen = (embedding(index, fixed["cloud"]) - offset).view(chunk, 2 * layer.points, 3) @ turn
+            seen = seen.view(chunk, layer.points, 6) * fixed["scale"] * (number > 0).to(seen.dtype)[:, None]
+            return [_pooled(linear(seen.view(-1, 6), weights[0], weights[1]), weights, chunk)]
 
         blocks = (center.view(-1, chunk, 3), rotation.view(-1, chunk, 3, 3))
-        _, pooled = scan(step, torch.zeros(1), blocks)
+        fixed = {"planes": planes, "cloud": cloud, "half": half, "shift": shift, "scale": scale, "rank": rank}
+        (pooled,) = in_blocks(step, blocks, (fixed, weights))
         return layer.correct(pooled.view(len(center), -1), center, rotation, context)
 
 
@@ -158,32 +164,33 @@ class GraphHeatmap(Heatmap):
         places, total = votes[0], votes.shape[1]
         chunk = _divisor(total, _PAIRS // total)
         voxel = torch.floor(places / voxel_size).T
-        x, y, z = (plane.clone() for plane in voxel)
+        columns = [plane.clone() for plane in voxel]
         blocks = voxel.T.reshape(-1, chunk, 3)
 
-        def differences(block: Tensor) -> list[Tensor]:
-            return [a - b for a, b in zip(block.T[:, :, None].unbind(0), (x, y, z), strict=True)]
+        def differences(block: Tensor, columns: list[Tensor]) -> list[Tensor]:
+            return [a - b for a, b in zip(block.T[:, :, None].unbind(0), columns, strict=True)]
 
-        def warm(carry: Tensor, block: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-            gx, gy, gz = (torch.relu(1.0 - (1.0 - SIDE) * (d * d)) for d in differences(block))
+        def warm(block: Sequence[Tensor], shared: tuple[list[Tensor], Tensor]) -> list[Tensor]:
+            columns, places = shared
+            gx, gy, gz = (torch.relu(1.0 - (1.0 - SIDE) * (d * d)) for d in differences(block[0], columns))
             weight = CENTER * (gx * gy * gz)
             heat = weight.sum(1)
-            return carry.clone(), (heat, weight @ places / heat[:, None])
+            return [heat, weight @ places / heat[:, None]]
 
-        _, (heat, mean) = scan(warm, torch.zeros(1), blocks)
+        heat, mean = in_blocks(warm, [blocks], (columns, places))
         heat = heat.view(total)
         index = torch.arange(total, dtype=torch.float32)
 
-        def beat(carry: Tensor, block: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            voxels, row_heat, number = block
-            dx, dy, dz = (d.abs() for d in differences(voxels))
+        def beat(block: Sequence[Tensor], shared: tuple[list[Tensor], Tensor, Tensor]) -> list[Tensor]:
+            (voxels, row_heat, number), (columns, heat, index) = block, shared
+            dx, dy, dz = (d.abs() for d in differences(voxels, columns))
             near = torch.maximum(torch.maximum(dx, dy), dz) <= window
             least = torch.where(index < number[:, None], _JUST_BELOW, TIE)
             ahead = torch.where(near, heat - row_heat[:, None] - least, -1.0)
-            return carry.clone(), (ahead.amax(1) > 0).to(heat.dtype)
+            return [(ahead.amax(1) > 0).to(heat.dtype)]
 
         rows = (blocks, heat.view(-1, chunk).clone(), index.view(-1, chunk).clone())
-        _, beaten = scan(beat, torch.zeros(1), rows)
+        (beaten,) = in_blocks(beat, rows, (columns, heat, index))
         return heat[None], beaten.view(1, total), mean.view(1, total, 3)
 
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Any
 
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 NAMES = ("ap_10", "ap_5", "ap_2")
 _COUNTS = ("scenes", "pairs", "unmatched", "worst_scene")

@@ -30,7 +30,7 @@ from attentionvote.model.rotation import (
     unit_quaternion,
 )
 from attentionvote.model.settings import NetworkSettings
-from attentionvote.setting import read
+from attentionvote.section import read
 
 
 class PoseChannels(NamedTuple):

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from attentionvote.setting import ChoicesOf, Setting, check
+from attentionvote.section import check
+from attentionvote.setting import ChoicesOf, Setting
 
 _FUSIONS = ChoicesOf("attentionvote.model.fusion", "FUSIONS", ("aml", "amx", "pn"))
 Widths = tuple[int, ...]

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from attentionvote.contract import ModelCard
 from attentionvote.export.parity_record import Limits, Parity
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 if TYPE_CHECKING:
     from attentionvote.evaluation.scene_result import Array

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from attentionvote.geometry.pose import inverse, rotation_about, transform
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 # A PhoXi M above a bin of 143 mm parts; the distance scales with the bin, so every bin fills the picture.
 REFERENCE_DISTANCE = 0.80

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.part import Parts
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 # The bin of the IPA-like protocol, for slender parts of 143 mm.
 REFERENCE_DIAMETER = 0.143

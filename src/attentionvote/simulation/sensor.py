@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.scene import Scene
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 from attentionvote.simulation.ray_selection import random_order
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 
 Shape = Literal["step", "cosine", "constant"]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from attentionvote.setting import Setting, check
+from attentionvote.section import check
+from attentionvote.setting import Setting
 from attentionvote.training.schedule import Schedule
 
 RotationLoss = Literal["metric", "slerp", "minra", "nlerp"]

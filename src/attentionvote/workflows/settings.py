@@ -9,7 +9,8 @@ from attentionvote.command.configuration import VerbSettings
 from attentionvote.command.sections import EXECUTOR, TRUSTED_KEY, WORKERS, Cluster, Store
 from attentionvote.export.parity_record import Limits
 from attentionvote.registry.gates import Rules
-from attentionvote.setting import Setting, Target
+from attentionvote.section import Target
+from attentionvote.setting import Setting
 from attentionvote.simulation.scene_spec import SimulationSettings
 from attentionvote.simulation.sensor import PRESETS
 from attentionvote.workflows.evaluate.settings import MeasuredBundle

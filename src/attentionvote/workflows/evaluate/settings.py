@@ -7,7 +7,8 @@ from typing import Annotated, ClassVar
 
 from attentionvote.command.configuration import VerbSettings
 from attentionvote.command.sections import TRUSTED_KEY, WORKERS, EvaluationSettings, Store
-from attentionvote.setting import Setting, Target
+from attentionvote.section import Target
+from attentionvote.setting import Setting
 from attentionvote.simulation.scene_spec import SimulationSettings
 
 

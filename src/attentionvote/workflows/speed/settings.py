@@ -7,7 +7,8 @@ from typing import Annotated, ClassVar
 
 from attentionvote.command.configuration import VerbSettings
 from attentionvote.command.sections import SEED
-from attentionvote.setting import Setting, Target
+from attentionvote.section import Target
+from attentionvote.setting import Setting
 
 
 @dataclass(frozen=True, kw_only=True)

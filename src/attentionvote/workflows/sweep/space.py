@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from attentionvote.command.configuration import check_types, leaves, type_problem
 from attentionvote.command.errors import ConfigurationError, nearest
 from attentionvote.command.identity import NOT_IDENTITY
-from attentionvote.setting import SettingError, check_value
+from attentionvote.section import check_value
+from attentionvote.setting import SettingError
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 

@@ -9,7 +9,8 @@ from attentionvote.command.configuration import VerbSettings
 from attentionvote.command.sections import EXECUTOR, SEED, Cluster, Tracking
 from attentionvote.data.settings import DataSettings
 from attentionvote.model.settings import NetworkSettings
-from attentionvote.setting import Setting, Target
+from attentionvote.section import Target
+from attentionvote.setting import Setting
 from attentionvote.simulation.scene_spec import SimulationSettings
 from attentionvote.training.settings import Loss, TrainerSettings
 
