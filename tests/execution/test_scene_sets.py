@@ -17,7 +17,7 @@ from attentionvote.data.clouds import measure_clouds
 from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution import Executor, RayCluster
 from attentionvote.part import Part
-from attentionvote.simulation import cycle_pool, scene_set
+from attentionvote.simulation import cycle, cycle_pool
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
@@ -39,13 +39,13 @@ def shards(directory: Path) -> dict[str, bytes]:
 
 @pytest.fixture(autouse=True)
 def quick_hulls(box: Part, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_set, "convex_hulls", lambda *_: (box.vertices[ConvexHull(box.vertices).vertices],))
+    monkeypatch.setattr(cycle, "convex_hulls", lambda *_: (box.vertices[ConvexHull(box.vertices).vertices],))
 
 
 @pytest.fixture(scope="session")
 def one_process(box: Part, tmp_path_factory: pytest.TempPathFactory) -> SceneSet:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_set, "convex_hulls", lambda *_: (box.vertices[ConvexHull(box.vertices).vertices],))
+        patch.setattr(cycle, "convex_hulls", lambda *_: (box.vertices[ConvexHull(box.vertices).vertices],))
         return generate_scene_set(box, spec_of(box), tmp_path_factory.mktemp("one"), progress=False)
 
 

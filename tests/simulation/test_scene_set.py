@@ -19,7 +19,7 @@ import pytest
 
 from attentionvote.geometry.pose import inverse
 from attentionvote.part import Part
-from attentionvote.simulation import cycle_pool, scene_set
+from attentionvote.simulation import cycle, cycle_pool, scene_set
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.scene_record import SceneRecord
@@ -32,7 +32,7 @@ COARSE = DropSettings(timestep=0.008, contact_time=0.02)
 @pytest.fixture(autouse=True)
 def known_hulls(hulls: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bracket's two boxes; coacd has its own tests."""
-    monkeypatch.setattr(scene_set, "convex_hulls", lambda *_: hulls)
+    monkeypatch.setattr(cycle, "convex_hulls", lambda *_: hulls)
 
 
 def make_spec(part: Part, **changes: object) -> SceneSetSpec:
@@ -164,10 +164,10 @@ def test_an_interrupted_set_is_not_opened_and_goes_on(
 SCRIPT = """
 import pickle, sys
 from pathlib import Path
-from attentionvote.simulation import scene_set
+from attentionvote.simulation import cycle, scene_set
 if __name__ == "__main__":
     part, hulls, spec, directory = pickle.loads(Path(sys.argv[1]).read_bytes())
-    scene_set.convex_hulls = lambda *_: hulls
+    cycle.convex_hulls = lambda *_: hulls
     scene_set.generate_scene_set(part, spec, directory, workers=2)
 """
 

@@ -78,7 +78,7 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
     assert (specs["train"].cycles, set(specs)) == (5, {"train", "test"})
     assert settings["seed"] == 3
     assert settings["camera"]["camera"] == {"width": 640, "height": 480}  # type: ignore[index]
-    with pytest.raises(SettingError, match="^there is no setting 'dorp', did you mean 'drop'"):
+    with pytest.raises(SettingError, match=r"^there is no setting 'dorp', did you mean 'drop'"):
         read(SimulationSettings, settings | {"dorp": 1})
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from attentionvote.geometry.pose import apply, transform
 from attentionvote.part import Part, PartSet
-from attentionvote.simulation import scene_set
+from attentionvote.simulation import cycle, scene_set
 from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.cycle import draw_part_ids, solids_of
 from attentionvote.simulation.drop_settings import BinSettings
@@ -31,7 +31,7 @@ CAMERA = Camera(160, 120, 250.0, 250.0, 80.0, 60.0)
 
 @pytest.fixture(autouse=True)
 def one_hull(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_set, "convex_hulls", lambda part, *_: (part.vertices,))
+    monkeypatch.setattr(cycle, "convex_hulls", lambda part, *_: (part.vertices,))
 
 
 @pytest.fixture

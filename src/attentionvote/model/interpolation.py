@@ -17,7 +17,7 @@ _FILE = "network_ops.c"
 
 def interpolate_reference(
     coarse: Float[Tensor, "batch coarse channels"],
-    fine: Float[Tensor, "batch fine own"],
+    fine: Float[Tensor, "batch fine fine_channels"],
     nearest: Int[Tensor, "batch fine 3"],
     weights: Float[Tensor, "batch fine 3"],
 ) -> Float[Tensor, "batch fine both"]:
@@ -30,15 +30,18 @@ def interpolate_reference(
         weights: of the three, sum one.
     """
     batch, rows, channels = coarse.shape
+    # [b, fine, 3] indices within a sample -> rows of [b * coarse, c]
     index = nearest + torch.arange(batch, device=coarse.device)[:, None, None] * rows
     # One table of rows: the gradient of a lookup in it costs a third of that of an index by sample and row.
+    # [b, coarse, c] -> [b * coarse, c] -> [b, fine, 3, c]
     gathered = torch.nn.functional.embedding(index, coarse.reshape(-1, channels))
+    # [b, fine, 3, c] * [b, fine, 3, 1] -> [b, fine, c]
     return torch.cat([(gathered * weights[..., None]).sum(-2), fine], dim=-1)
 
 
 def interpolate(
     coarse: Float[Tensor, "batch coarse channels"],
-    fine: Float[Tensor, "batch fine own"],
+    fine: Float[Tensor, "batch fine fine_channels"],
     nearest: Int[Tensor, "batch fine 3"],
     weights: Float[Tensor, "batch fine 3"],
 ) -> Float[Tensor, "batch fine both"]:

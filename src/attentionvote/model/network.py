@@ -1,8 +1,9 @@
 """AttentionVote: points and normals in, poses of all instances out (paper section 3, Fig. 1).
 
-Letters of the shapes in this package's comments: b samples of the batch, n points of a sample, s centres of a level,
-m votes (one a seed), k proposals (K), h votes gathered for a proposal (H) or neighbours of a centre, c channels, r rows
-(proposals of all samples, or those asked for).
+Letters of the shapes in the comments of ``model`` and ``training``: b samples of the batch, n points of a sample, i its
+instances, s centres of a level, m votes (one a seed), k proposals (K), h votes gathered for a proposal (H) or
+neighbours of a centre, c channels, g members of a symmetry group, r rows (proposals of all samples, or those asked
+for).
 """
 
 from __future__ import annotations

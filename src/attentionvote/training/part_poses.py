@@ -16,7 +16,7 @@ from torch import Tensor
 
 from attentionvote.model.precision import full_precision
 from attentionvote.part import Parts
-from attentionvote.training.pose_loss import _TINY, RotationLoss, SymmetricPose
+from attentionvote.training.pose_loss import RotationLoss, SymmetricPose, metric_loss
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,12 @@ class PartPoses:
         """As ``SymmetricPose.squared_turn``, by each row's own part."""
         if len(self.each) == 1:
             return self.each[0].squared_turn(predicted, true)
+        # [parts, ...] -> [r, ...]
         representation, equivalents = (t.to(predicted.dtype).to(true.device)[part] for t in self._tables)
         with full_precision(true.device):
+            # [r, 1, 3, 3] @ [r, g, 3, 3] -> [r, g, 3, 3]
             aims = true[:, None] @ equivalents
+            # [r, 3, 3] -> [r, 1, 3, 3]
             now = (predicted @ representation)[:, None]
             return (now - aims).square().sum((-2, -1)).amin(1)
 
@@ -72,11 +75,10 @@ class PartPoses:
         Raises:
             ValueError: on an unknown ``kind``.
         """
+        if kind == "metric":
+            return metric_loss(self.squared_turn(part, rotation, true), self.diameter(part, rotation.dtype))
         if len(self.each) == 1:
             return self.each[0].rotation_loss(kind, quaternion, rotation, true)
-        if kind == "metric":
-            diameter = self.diameter(part, rotation.dtype)
-            return (self.squared_turn(part, rotation, true) + (_TINY * diameter) ** 2).sqrt() / (0.1 * diameter)
         # Quaternion forms enumerate the equivalents in numpy: part by part is no slower.
         loss = rotation.new_zeros(len(part))
         for index, pose in enumerate(self.each):

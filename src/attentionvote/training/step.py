@@ -26,6 +26,7 @@ def batch_loss(
     if ramp <= 0:
         return terms
     peaks = model.find_peaks(votes)
+    # [b, k] -> [b * k]
     heat = peaks.heat.flatten()
     rows = torch.nonzero((heat >= least_heat) & (heat > 0))[:, 0]
     rows, selected_count = _even_choice(rows, loss.settings.rows_per_scene * len(batch.points), len(heat))
@@ -44,7 +45,7 @@ def batch_loss(
     return terms
 
 
-def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[Int[Tensor, " chosen"], int]:
+def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[Int[Tensor, " selected"], int]:
     """Every n-th row of the whole batch, so that ``most`` a process are left at most on average.
 
     Args:
@@ -53,7 +54,7 @@ def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[In
         places: rows that each process could have; the whole batch is the processes' places one after the other.
 
     Returns:
-        this process's share of the choice, and the number of all chosen rows.
+        this process's share of the choice, and the number of all selected rows.
     """
     totals = everyones(torch.stack([rows.new_tensor(len(rows)), rows.sum()])).tolist()
     count = sum(size for size, _ in totals)

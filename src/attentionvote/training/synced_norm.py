@@ -24,11 +24,13 @@ class SyncedRowNorm(RowNorm):
         """Normalise each channel over the rows of all processes (running statistics in evaluation)."""
         if not self.training:
             return super().forward(x)
+        # [..., c] -> [r, c]
         rows = x.reshape(-1, x.shape[-1])
         count, mean, variance = _statistics(rows)
         self._remember(count, mean, variance)
         scale = (variance + self.eps).rsqrt()
         out: Tensor = _Normalize.apply(rows, self.weight, self.bias, mean, scale, count)
+        # [r, c] -> [..., c]
         return out.view(x.shape)
 
     @torch.no_grad()
@@ -74,6 +76,7 @@ def _statistics(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     local_sum = (wide - local_mean).square().sum(0)
     size = local_mean.new_full((1,), float(len(wide)), dtype=torch.float64)
     gathered = everyones(torch.cat([size, local_mean.double(), local_sum.double()]))
+    # [processes, 1 + 2 c] -> [processes, 1] and two of [processes, c]
     counts, means, sums = gathered[:, :1], *gathered[:, 1:].chunk(2, dim=1)
     count = counts.sum().clamp(min=1.0)
     mean = (counts * means).sum(0) / count
