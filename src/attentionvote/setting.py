@@ -158,5 +158,5 @@ def wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
 
 
 def _near(name: str, valid: Collection[str]) -> str:
-    close = get_close_matches(name, valid, n=1)
+    close = get_close_matches(name, valid, n=1, cutoff=0.5)
     return f", did you mean {close[0]!r}?" if close else ""

@@ -17,7 +17,7 @@ from attentionvote.data.clouds import measure_clouds
 from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution import Executor, RayCluster
 from attentionvote.part import Part
-from attentionvote.simulation import cycle, cycle_pool
+from attentionvote.simulation import cycle, scene_set
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
@@ -73,13 +73,13 @@ def test_the_cycle_of_a_killed_ray_worker_is_done_again(
     ray_cluster: RayCluster, one_process: SceneSet, box: Part, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory, stored, killed = tmp_path / "set", [], []
-    store: Callable[..., None] = cycle_pool.store_cycle
+    save: Callable[..., None] = scene_set.save_records
 
-    def recording(folder: Path, cycle: int, records: list) -> None:
-        stored.append(cycle)
-        store(folder, cycle, records)
+    def recording(path: Path, records: list) -> None:
+        stored.append(int(path.stem))
+        save(path, records)
 
-    monkeypatch.setattr(cycle_pool, "store_cycle", recording)
+    monkeypatch.setattr(scene_set, "save_records", recording)
 
     def kill_one() -> None:
         deadline = time.monotonic() + 60

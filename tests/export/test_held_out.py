@@ -18,9 +18,9 @@ from attentionvote.export.checkpoint_card import model_card
 from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.section import read
-from attentionvote.simulation import cycle, scene_set
+from attentionvote.simulation import cycle
 from attentionvote.simulation.raycast import PartCaster
-from attentionvote.simulation.scene_set import SceneSet
+from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import SimulationSettings, scene_set_directory, scene_set_specs
 
 CAMERA = {"width": 344, "height": 257, "fx": 567.0, "fy": 567.0, "cx": 172.0, "cy": 128.5}
@@ -49,7 +49,7 @@ def root(part: Part, tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(cycle, "convex_hulls", lambda p, *_: (p.vertices[ConvexHull(p.vertices).vertices],))
         for spec in scene_set_specs(part, read(SimulationSettings, SETTINGS)).values():
             directory = scene_set_directory(folder / "scenes", part.name, spec)
-            scene_set.generate_scene_set(part, spec, directory, progress=False)
+            generate_scene_set(part, spec, directory, progress=False)
     return folder
 
 

@@ -15,6 +15,8 @@ import bench_serve
 import numpy as np
 import pytest
 
+from attentionvote.workflows.speed.serving import Expected, Tally, _ask, expectations, server
+
 ROOT = Path(__file__).resolve().parents[2]
 # Writes a tiny signed bundle with the tests' own builder, in a process of its own: fixtures do not cross folders.
 BUILDER = """
@@ -62,7 +64,7 @@ def test_a_wrong_answer_is_noticed(
     signed: tuple[Path, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bundle, key = signed
-    right = bench_serve.expectations(bundle, key)
+    right = expectations(bundle, key)
     assert len(right) == 3
     moved = right[1].camera_from_part.copy()
     moved[0, 0, 3] += 1e-5  # ten micrometres
@@ -74,9 +76,9 @@ def test_a_wrong_answer_is_noticed(
 
 
 def test_a_missing_answer_is_noticed() -> None:
-    tally = bench_serve.Tally()
-    nothing = bench_serve.Expected(np.zeros((1, 3), np.float32), np.zeros((0, 4, 4)), np.zeros(0, np.float32))
-    bench_serve._ask("http://127.0.0.1:1", [nothing], 0, tally, time.monotonic() + 0.2)
+    tally = Tally()
+    nothing = Expected(np.zeros((1, 3), np.float32), np.zeros((0, 4, 4)), np.zeros(0, np.float32))
+    _ask("http://127.0.0.1:1", [nothing], 0, tally, time.monotonic() + 0.2)
     assert not tally.seconds
     assert tally.lost[0].startswith("Unreachable: http://127.0.0.1:1 cannot be reached")
 
@@ -102,7 +104,7 @@ def test_a_bundle_that_cannot_be_trusted_is_one_sentence(
 
 def test_a_server_that_does_not_start_is_one_sentence(signed: tuple[Path, Path], tmp_path: Path) -> None:
     def start() -> Any:
-        with bench_serve.server(signed[0], tmp_path / "no.pub", 2) as url:
+        with server(signed[0], tmp_path / "no.pub", 2) as url:
             return url
 
     with pytest.raises(OSError, match=r"the server did not start: serve: .*no\.pub must be a public key"):

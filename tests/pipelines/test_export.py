@@ -18,6 +18,7 @@ from tiny_network import EXPORT_CHANGES, TINY_ARGUMENTS
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.files import FolderUnavailable
 from attentionvote.inference import load_bundle
 from attentionvote.model.network import AttentionVote
 from attentionvote.training.checkpoint import load_trained, save_trained
@@ -240,14 +241,14 @@ def test_one_process_exports_a_part(two_trainings: list[str]) -> None:
     from attentionvote.workflows.export import ExportJob
 
     job = ExportJob.find(compose(ExportSettings, two_trainings))
-    refused = pytest.raises(ConfigurationError, match="another process is at this part's export")
+    refused = pytest.raises(FolderUnavailable, match="another process is at this part's export")
     with job.locked(), refused, job.locked():
         raise AssertionError("two at once")
 
 
 def test_a_place_that_cannot_be_written_is_said_first(two_trainings: list[str], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigurationError, match=r"outputs=.*/file/x cannot be written: Not a directory"):
+    with pytest.raises(FolderUnavailable, match=r"outputs=.*/file/x cannot be written: Not a directory"):
         export.run(compose(ExportSettings, [*two_trainings, f"outputs={tmp_path}/file/x"]))
 
 

@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("quick_training")
 
 @pytest.fixture(scope="module")
 def brick() -> Part:
-    return load_part("brick", "builtin:brick", diameter=compose(TrainSettings, TINY).object.diameter)
+    return load_part("brick", "builtin:brick", diameter=compose(TrainSettings, TINY).object.arguments["diameter"])
 
 
 @pytest.fixture(scope="module")

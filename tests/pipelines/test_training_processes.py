@@ -17,7 +17,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import start_processes
 import train
 from same_training import assert_same_training, runs
 from tiny_training import TINY_TRAINING
@@ -26,6 +25,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.workflows.train.processes import Place, first_speaks, refuse_grid
 from attentionvote.workflows.train.settings import TrainSettings
+from attentionvote.workflows.train.torchrun import _cause
 
 ROOT = Path(__file__).resolve().parents[2]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
@@ -145,7 +145,7 @@ def test_a_number_of_processes_that_is_none_is_one_sentence(processes: str) -> N
 def test_what_a_signal_ended_is_the_cause_whoever_is_seen_first(exit_codes: tuple[int, ...], cause: int) -> None:
     """As torchrun finds them: one after the other, in the order of their ranks."""
     failures = {rank: SimpleNamespace(exitcode=code, timestamp=100.0 + rank) for rank, code in enumerate(exit_codes)}
-    rank, failure = start_processes._cause(failures)  # type: ignore[arg-type]
+    rank, failure = _cause(failures)  # type: ignore[arg-type]
     assert (rank, failure.exitcode) == (cause, exit_codes[cause])
 
 

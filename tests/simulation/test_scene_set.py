@@ -79,7 +79,7 @@ def test_two_workers_give_the_same_bits_as_one(
 def test_a_complete_set_is_not_touched(bracket: Part, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = make_spec(bracket, cycles=1, drop_counts=(1,))
     first = generate_scene_set(bracket, spec, tmp_path, progress=False)
-    monkeypatch.setattr(cycle_pool, "run_cycles", lambda *_, **__: pytest.fail("simulated again"))
+    monkeypatch.setattr(scene_set, "run_cycles", lambda *_, **__: pytest.fail("simulated again"))
     assert generate_scene_set(bracket, spec, tmp_path, progress=False).digest == first.digest
     assert SceneSet.is_complete(tmp_path)
 
@@ -231,8 +231,8 @@ def test_the_cycle_of_a_killed_worker_is_done_again(
 ) -> None:
     spec, directory = make_spec(bracket, cycles=60), tmp_path / "set"
     before = set(multiprocessing.active_children())
-    killed, stored, store = [], [], cycle_pool.store_cycle
-    monkeypatch.setattr(cycle_pool, "store_cycle", lambda *a: (stored.append(a[1]), store(*a)))
+    killed, stored, save = [], [], scene_set.save_records
+    monkeypatch.setattr(scene_set, "save_records", lambda *a: (stored.append(int(a[0].stem)), save(*a)))
 
     def kill_one() -> None:
         deadline = time.monotonic() + 60
