@@ -128,7 +128,7 @@ class Material:
         from attentionvote.model.network import AttentionVote
 
         torch.manual_seed(self.seed)
-        model: AttentionVote = AttentionVote(**network_arguments(self.trainings[size].model, self.part))
+        model = AttentionVote.from_arguments(network_arguments(self.trainings[size].model, self.part))
         return model.eval()
 
     def batch(self, size: str, scenes: int | None = None) -> Batch:

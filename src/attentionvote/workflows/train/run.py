@@ -62,7 +62,7 @@ class TrainingRun:
         self.threads = t.threads or process.cores
         torch.set_num_threads(self.threads)
         arguments = network_arguments(cfg.model, part)
-        model: AttentionVote = AttentionVote(**arguments)
+        model = AttentionVote.from_arguments(arguments)
         loss = AttentionVoteLoss(part, asdict(cfg.loss.weights), cfg.loss.settings)
         self.clouds = CloudSettings(cfg.data.sensor, cfg.data.density, cfg.data.pool, cfg.data.normal_neighbors)
         metadata = {
