@@ -14,6 +14,7 @@ from settings_of_verbs import settings_of
 from attentionvote.command.conf_folder import CONF, SCRIPTS, choices, primary_groups
 from attentionvote.command.configuration import compose, leaves
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.model.fusion import FUSIONS
 from attentionvote.section import Target, check_value, find
 from attentionvote.section import leaves as fields_below
 from attentionvote.setting import Field, SettingError, without_null
@@ -110,7 +111,8 @@ def test_every_number_has_bounds_on_both_sides_and_beyond_them_a_sentence(verb: 
         ("simulation.drop.speed=50", "simulation.drop.speed must be greater than 0 and at most 5; got 50"),
         ("simulation.drop.hull_vertices=4",
          "simulation.drop.hull_vertices must be at least 8 and at most 256; got 4"),
-        ("model.fusion_kind=amk", "model.fusion_kind must be one of aml, amx, pn; got 'amk', did you mean 'amx'?"),
+        ("model.fusion_kind=amk",
+         f"model.fusion_kind must be one of {', '.join(FUSIONS)}; got 'amk', did you mean 'amx'?"),
         # What Hydra's grammar adds or takes away.
         ("+trainer.accumulate_grad_batches=2", "there is no setting 'trainer.accumulate_grad_batches'"),
         ("~trainer.schedule", "trainer.schedule must be given"),

@@ -32,10 +32,10 @@ def check_sensor(sensor: Sensor) -> None:
     Raises:
         ValueError: with one sentence.
     """
-    if sensor.preset == "phoxi":
+    if sensor.preset not in ("gaussian", "none"):
         raise ValueError(
             "data.sensor.preset must be gaussian or none with data.dataset, whose pictures are measured already; got "
-            "'phoxi'"
+            f"{sensor.preset!r}"
         )
 
 
