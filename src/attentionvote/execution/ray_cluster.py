@@ -47,7 +47,7 @@ class RayCluster:
             )
 
     @contextmanager
-    def kept(self, cores: int) -> Iterator[RayCluster]:
+    def shared(self, cores: int) -> Iterator[RayCluster]:
         """One cluster for many calls, those of child processes too: itself, or one of this machine for the block.
 
         Args:
@@ -91,10 +91,10 @@ class RayCluster:
                 ray.shutdown()
 
     def _join(self, ray: Any, cores: int) -> None:
-        own = {} if self.address else {"num_cpus": cores, "include_dashboard": False}
-        own |= {} if self.address else {"object_store_memory": _OBJECT_STORE}
+        started = {} if self.address else {"num_cpus": cores, "include_dashboard": False}
+        started |= {} if self.address else {"object_store_memory": _OBJECT_STORE}
         try:
-            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **own)
+            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **started)
         except Exception as error:  # Ray's own too, of a node that takes too long to start
             first = str(error).strip().partition("\n")[0]
             raise ConnectionError(
