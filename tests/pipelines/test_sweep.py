@@ -213,9 +213,7 @@ def test_trials_of_one_machine_share_its_gpus(words: list[str], monkeypatch: pyt
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
 
     def gpu(slot: int, *more: str) -> str | None:
-        said = [*words, *more]
-        job = SweepJob(compose(SweepSettings, said), sweep.training_words(said), "smoke")
-        return job._environment(9, slot).get("CUDA_VISIBLE_DEVICES")
+        return sweep_of([*words, *more])._environment(9, slot).get("CUDA_VISIBLE_DEVICES")
 
     assert [gpu(slot, "workers=3") for slot in range(3)] == ["4", "6", "4"]
     assert gpu(0, "workers=1") is None

@@ -7,7 +7,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import optuna
 import pytest
+from optuna.storages import RDBStorage
 from optuna.trial import TrialState
 
 from attentionvote.workflows.sweep.space import Setting
@@ -62,6 +64,27 @@ def test_a_lost_trial_keeps_its_number_parameters_and_reports(tmp_path: Path) ->
     again.end(trial, TrialState.FAIL, reason="why")
     assert (again.trials[0].state, again.trials[0].user_attrs["reason"]) == (TrialState.FAIL, "why")
     assert (again.best, again.lost(), len(again.trials)) == (None, [], 1)
+
+
+@pytest.mark.filterwarnings("ignore")  # heartbeats of Optuna's are experimental
+def test_a_study_without_a_lease_goes_on(tmp_path: Path) -> None:
+    # As sweeps wrote them before: whose a trial is was an attribute of it, its signs of life were Optuna's.
+    url = f"sqlite:///{tmp_path / 'study.db'}"
+    storage = RDBStorage(url, heartbeat_interval=60, grace_period=180)
+    study = optuna.create_study(storage=storage, study_name="s", direction="maximize")
+    for _ in range(2):
+        begun = study.ask()
+        for setting in SPACE:
+            setting.suggest(begun)
+        begun.set_user_attr("owner", "elsewhere:/sweeps/s")
+    study.tell(0, 0.5)
+    again = ledger(tmp_path)
+    (lost,) = again.lost()
+    trial, values = again.begin(lost)
+    again.end(trial, TrialState.COMPLETE, score(values))
+    assert [t.params for t in again.trials] == [t.params for t in study.trials]
+    assert again.count(TrialState.COMPLETE) == 2
+    storage.engine.dispose()
 
 
 def test_one_sweep_at_a_time_from_several_places(tmp_path: Path) -> None:

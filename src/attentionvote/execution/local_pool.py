@@ -91,8 +91,8 @@ class _Pool:
                 worker = lines[event] if isinstance(event, Connection) else ends[event]  # type: ignore[index]
                 if worker not in self.workers:
                     continue  # its line and its end came together
-                said = worker.receive()
-                if said is None:
+                message = worker.receive()
+                if message is None:
                     self._bury(worker)
                     continue
                 index = worker.job
@@ -101,7 +101,7 @@ class _Pool:
                     self.attempts.finished += 1
                 self._employ(worker)
                 if index is not None:
-                    yield index, said
+                    yield index, message
 
     def _employ(self, worker: _Worker) -> None:
         """Give the worker the next job, or let it go."""

@@ -54,8 +54,8 @@ def result_of(outcome: bytes) -> Any:
 
 def worker_environment(threads: int) -> dict[str, str]:
     """Variables of a worker's process: its threads, and where this process finds modules."""
-    found = os.pathsep.join(path for path in sys.path if path)
-    return dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"PYTHONPATH": found}
+    search_path = os.pathsep.join(path for path in sys.path if path)
+    return dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"PYTHONPATH": search_path}
 
 
 @contextmanager
