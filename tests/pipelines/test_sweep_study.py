@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import optuna
@@ -14,6 +15,7 @@ from optuna.trial import TrialState
 
 from attentionvote.workflows.sweep.space import Setting
 from attentionvote.workflows.sweep.study import Ledger, make_pruner, open_study, study_name
+from attentionvote.workflows.sweep.trial_report import TrialReport
 
 SPACE = [
     Setting("x", "float", 0.0, 1.0),
@@ -107,6 +109,23 @@ def test_one_sweep_at_a_time_from_several_places(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"gave no sign of life for 3 s and the one at .*/elsewhere took the study s"):
         first.end(trial, TrialState.FAIL)
     assert [t.state for t in second.trials] == [TrialState.RUNNING]
+
+
+def test_a_training_whose_trial_was_taken_over_reports_nothing_and_ends(tmp_path: Path) -> None:
+    here = ledger(tmp_path)
+    here.begin()
+    report = TrialReport(here.stored, 0, here.owner)
+    validated: Any = SimpleNamespace(
+        sanity_checking=False, callback_metrics={"val/ap": 0.5}, current_epoch=0, max_epochs=4
+    )
+    report.on_validation_end(validated, validated)
+    here.stored.lease("elsewhere:/sweeps/s")
+    validated.current_epoch = 1
+    with pytest.raises(
+        ValueError, match="because the sweep at elsewhere:/sweeps/s took its trial 0 over"
+    ):
+        report.on_validation_end(validated, validated)
+    assert here.trials[0].intermediate_values == {1: 0.5}
 
 
 @pytest.mark.parametrize(

@@ -94,11 +94,6 @@ class JobProcess:
             self._close()
             raise
 
-    @property
-    def pid(self) -> int:
-        """The process id."""
-        return self._process.pid
-
     def done(self) -> bool:
         """Whether the job has ended."""
         return self._process.poll() is not None
