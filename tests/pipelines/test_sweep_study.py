@@ -121,9 +121,7 @@ def test_a_training_whose_trial_was_taken_over_reports_nothing_and_ends(tmp_path
     report.on_validation_end(validated, validated)
     here.stored.lease("elsewhere:/sweeps/s")
     validated.current_epoch = 1
-    with pytest.raises(
-        ValueError, match="because the sweep at elsewhere:/sweeps/s took its trial 0 over"
-    ):
+    with pytest.raises(ValueError, match="because the sweep at elsewhere:/sweeps/s took its trial 0 over"):
         report.on_validation_end(validated, validated)
     assert here.trials[0].intermediate_values == {1: 0.5}
 
