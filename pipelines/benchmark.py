@@ -15,12 +15,12 @@ from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.train.preset import preset_of_hardware
 
 if __name__ == "__main__":
-    said: list[str] = []
+    composed_words: list[str] = []
 
     def presets(words: list[str]) -> list[str]:
         """The preset of this machine, chosen and said once."""
         machine = preset_of_hardware(words)
-        said[:] = [*machine, *words]
+        composed_words[:] = [*machine, *words]
         return machine
 
-    command(TablesSettings, lambda cfg: run(cfg, said), defaults=presets)
+    command(TablesSettings, lambda cfg: run(cfg, composed_words), defaults=presets)

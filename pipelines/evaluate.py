@@ -33,14 +33,14 @@ def run(cfg: EvaluateSettings) -> dict[str, Any]:
         with configuring():
             frozen = job.evaluation_set()
         name = f"{job.bundle.digest[:12]}-{frozen.digest[:12]}{job.otherwise}"
-        place = folder / f"{name}-{cfg.evaluation.threads}.json"
-        result = read_json(place)
+        path = folder / f"{name}-{cfg.evaluation.threads}.json"
+        result = read_json(path)
         if result is not None and "ap_by_threshold" in result and not cfg.force:
-            log.info("this evaluation is done (force=true repeats it): %s", place)
+            log.info("this evaluation is done (force=true repeats it): %s", path)
             result |= {"frozen": is_recorded(cfg, job.part, frozen)}
         else:
             result = described(job, frozen, job.measure([job.bundle], frozen)[0])
-            write_json(place, result)
+            write_json(path, result)
         show(result)
         # Also when it is done: the store may have been away.
         record(cfg.tracking.store, job.bundle.card.run_id, result, f"{name}.json", job.is_standard)

@@ -19,7 +19,7 @@ from attentionvote.command.words import words_beside, words_of
 from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.train.preset import preset_of_workers
 
-_PLACE = ("executor", "cluster")  # settings that say where trials run
+_WHERE = ("executor", "cluster")  # settings that say where trials run
 
 
 def run(cfg: SweepSettings, words: Sequence[str]) -> dict[str, Any]:
@@ -44,19 +44,19 @@ def run(cfg: SweepSettings, words: Sequence[str]) -> dict[str, Any]:
 
 def training_words(words: Sequence[str]) -> list[str]:
     """The words that are about the trainings, not about the sweep."""
-    return words_beside("sweep", ("sweep", "workers", "force", "resume", *_PLACE), words)
+    return words_beside("sweep", ("sweep", "workers", "force", "resume", *_WHERE), words)
 
 
 def preset_of_trials(words: Sequence[str]) -> list[str]:
     """The preset of the machines that train, told by the words that say which these are."""
-    place = words_of(_PLACE, words)
-    return preset_of_workers(compose(SweepSettings, [f"object={choices('object')[0]}", *place]), words)
+    where = words_of(_WHERE, words)
+    return preset_of_workers(compose(SweepSettings, [f"object={choices('object')[0]}", *where]), words)
 
 
 def _space_name(words: Sequence[str]) -> str:
     """The chosen file of conf/sweep."""
-    said = [word.partition("=")[2] for word in words if word.lstrip("+").startswith("sweep=")]
-    return said[-1] if said else str(primary_groups("sweep")["sweep"])
+    names = [word.partition("=")[2] for word in words if word.lstrip("+").startswith("sweep=")]
+    return names[-1] if names else str(primary_groups("sweep")["sweep"])
 
 
 def check(cfg: SweepSettings) -> None:
@@ -68,14 +68,14 @@ def check(cfg: SweepSettings) -> None:
 
 def main() -> None:
     """The verb; its trials need the words as they were said."""
-    said: list[str] = []
+    composed_words: list[str] = []
 
     def defaults(words: list[str]) -> list[str]:
         machine = preset_of_trials(words)
-        said[:] = [*machine, *words]
+        composed_words[:] = [*machine, *words]
         return machine
 
-    command(SweepSettings, lambda cfg: run(cfg, said), defaults=defaults, check=check)
+    command(SweepSettings, lambda cfg: run(cfg, composed_words), defaults=defaults, check=check)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Any
 
 from attentionvote.command.entry import command, configuring
 from attentionvote.workflows.train.preset import preset_of_hardware
-from attentionvote.workflows.train.processes import Place, failing_at_once, first_speaks
+from attentionvote.workflows.train.processes import TrainingProcess, failing_at_once, first_speaks
 from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
@@ -27,21 +27,21 @@ log = logging.getLogger("attentionvote.train")
 
 def run(cfg: TrainSettings) -> dict[str, Any] | None:
     """Make or read scenes, train, test; test figures and where the model is, None in all processes but the first."""
-    place = Place.of(os.environ)
-    with first_speaks(place):
-        return _run(cfg, place)
+    process = TrainingProcess.of(os.environ)
+    with first_speaks(process):
+        return _run(cfg, process)
 
 
-def _run(cfg: TrainSettings, place: Place) -> dict[str, Any] | None:
+def _run(cfg: TrainSettings, process: TrainingProcess) -> dict[str, Any] | None:
     from attentionvote.workflows.train.job import find_training
 
     with configuring(f"object {cfg.object.name}"):
         job = find_training(cfg)
     with configuring():
-        place.check(cfg.trainer.batch_size, job.scene_counts)
+        process.check(cfg.trainer.batch_size, job.scene_counts)
     # The lock comes before the meeting: a training that another process is at ends at once.
-    with job.locked() if place.rank == 0 else nullcontext(), place.joined(cfg.trainer.accelerator) as first_does:
-        result = job.result if place.rank == 0 else None
+    with job.locked() if process.rank == 0 else nullcontext(), process.joined(cfg.trainer.accelerator) as first_does:
+        result = job.result if process.rank == 0 else None
         complete = result is not None and cfg.resume != "never" and not cfg.force
         if first_does("complete", lambda: complete):
             if result is not None:
@@ -53,8 +53,8 @@ def _run(cfg: TrainSettings, place: Place) -> dict[str, Any] | None:
         from attentionvote.workflows.train.run import TrainingRun
 
         with configuring():
-            training = TrainingRun(cfg, job, place, first_does)
-        if place.rank == 0 and (cfg.resume == "never" or (cfg.force and result is not None)):
+            training = TrainingRun(cfg, job, process, first_does)
+        if process.rank == 0 and (cfg.resume == "never" or (cfg.force and result is not None)):
             job.forget()
         return training.run()
 

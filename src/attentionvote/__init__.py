@@ -12,4 +12,4 @@ Conventions, stated once and tested once (``tests/test_conventions.py``):
   sample of a ball: that is what a ball query returns, in training, export and tests alike.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

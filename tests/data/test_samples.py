@@ -17,11 +17,11 @@ from attentionvote.scene import Scene
 
 
 def equal(a: Batch, b: Batch) -> bool:
-    plain = [name for name in Batch._fields if name != "found"]
+    plain = [name for name in Batch._fields if name != "neighborhoods"]
     same = all(torch.equal(getattr(a, name), getattr(b, name)) for name in plain)
-    levels = [(a.found.order, b.found.order)]
+    levels = [(a.neighborhoods.order, b.neighborhoods.order)]
     for name in ("neighbors", "nearest", "weights"):
-        levels += list(zip(getattr(a.found, name), getattr(b.found, name), strict=True))
+        levels += list(zip(getattr(a.neighborhoods, name), getattr(b.neighborhoods, name), strict=True))
     return same and all(torch.equal(x, y) for x, y in levels)
 
 
@@ -73,7 +73,7 @@ def test_a_sample_keeps_points_normals_and_instances_together(clouds: Clouds, la
     np.testing.assert_array_equal(sample.rotation.numpy(), scene.camera_from_part[:, :3, :3].astype(np.float32))
     np.testing.assert_array_equal(sample.center.numpy(), scene.camera_from_part[:, :3, 3].astype(np.float32))
     np.testing.assert_array_equal(sample.visible.numpy(), scene.visible_fraction.astype(np.float32))
-    assert torch.equal(sample.found.order, find_neighborhoods(sample.points.numpy(), layout).order)
+    assert torch.equal(sample.neighborhoods.order, find_neighborhoods(sample.points.numpy(), layout).order)
 
 
 def test_moved_points_still_lie_on_their_own_instance(clouds: Clouds, layout: Layout) -> None:
@@ -117,7 +117,7 @@ def test_a_batch_pads_instances_that_nobody_takes_for_real(clouds: Clouds, layou
     assert torch.equal(batch.rotation[0, 1:], torch.eye(3).expand(3, 3, 3))
     assert torch.equal(batch.visible[0, 1:], torch.zeros(3))
     assert torch.equal(batch.rotation[1], samples[1].rotation)
-    assert torch.equal(batch.found.neighbors[2][1], samples[1].found.neighbors[2])
+    assert torch.equal(batch.neighborhoods.neighbors[2][1], samples[1].neighborhoods.neighbors[2])
 
 
 def test_the_first_samples_of_a_batch_are_a_batch(clouds: Clouds, layout: Layout) -> None:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+import attentionvote
+
 if TYPE_CHECKING:
     from conftest import Cell
 
@@ -30,7 +32,7 @@ def run(*command: str | Path, cwd: Path | None = None) -> str:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory, wheels: Path) -> Path:
-    """A virtual environment with the locked packages and the project's wheel."""
+    """A virtual environment with the locked packages and the wheel of `python -m build`."""
     folder = tmp_path_factory.mktemp("serving")
     source = folder / "source"
     source.mkdir()
@@ -42,7 +44,9 @@ def environment(tmp_path_factory: pytest.TempPathFactory, wheels: Path) -> Path:
     pip = [sys.executable, "-m", "pip", "--python", str(target / "bin" / "python"), "--disable-pip-version-check"]
     offline = ("--quiet", "--no-compile", "--no-index", "--find-links", wheels, "--no-deps")
     run(*pip, "install", *offline, "--require-hashes", "-r", ROOT / "docker" / "requirements.txt")
-    run(*pip, "install", *offline, source)
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder / "wheel", source)
+    (wheel,) = (folder / "wheel").glob(f"attentionvote-{attentionvote.__version__}-*.whl")
+    run(*pip, "install", *offline, wheel)
     assert "No broken requirements found." in run(*pip, "check")
     return target
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 import warm_starter
 from numpy.typing import NDArray
+from tiny_network import EXPORT_CHANGES, TINY_ARGUMENTS, with_random_norms
 
 from attentionvote.contract import ModelCard
 from attentionvote.export.checkpoint_card import model_card
@@ -23,50 +24,22 @@ from attentionvote.simulation.part_files import load_part
 from attentionvote.training.checkpoint import save_trained
 
 POINTS = 300
-NETWORK: dict[str, Any] = {
-    "centers": [64, 32, 16, 8],
-    "neighbors": [16, 8, 8, 4],
-    "widths": [[8, 16], [16, 16], [16, 16], [16, 16]],
-    "propagation": [16, 16],
-    "residual": True,
-    "radius_fraction": 0.2,
-    "voxel_fraction": 0.2,
-    "voting": [16],
-    "vote_rotation": True,
-    "proposals": 8,
-    "peak_window": 1,
-    "center_seed": "mean",
-    "gathered": 8,
-    "fusion": [16, 16],
-    "head": [16],
-    "rotation": "six",
-    "confidence": "quality",
-    "refinement": {"points": 24, "widths": [8, 16], "head": [16]},
-    "merge_fraction": 0.08,
-}
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def random_network(part: Part, seed: int = 0) -> AttentionVote:
     """Random weights and norms that are not the identity; votes stay near their seeds, so that peaks differ."""
     torch.manual_seed(seed)
-    box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
-    model = AttentionVote(diameter=part.diameter, box=box, **NETWORK)
-    for module in model.modules():
-        if isinstance(module, torch.nn.BatchNorm1d):
-            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
-            torch.nn.init.normal_(module.bias, std=0.2)
-            torch.nn.init.normal_(module.running_mean, std=0.2)
-            torch.nn.init.uniform_(module.running_var, 0.5, 2.0)
+    model = with_random_norms(AttentionVote.from_arguments(arguments_of(part)))
     for refiner in model.refiners:
         torch.nn.init.normal_(refiner.output.weight, std=0.05)
-    return model.eval()
+    return model
 
 
 def arguments_of(part: Part) -> dict[str, Any]:
     """The network's arguments as a checkpoint keeps them."""
     box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
-    return NETWORK | {"diameter": float(part.diameter), "box": box}
+    return TINY_ARGUMENTS | EXPORT_CHANGES | {"diameter": float(part.diameter), "box": box}
 
 
 def metadata_of(part: Part, **changes: Any) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def test_a_networks_own_test_radius_is_on_its_card(
 
 def test_a_threshold_that_no_farthest_vote_passes_is_refused(make_metadata: Callable[..., dict[str, Any]]) -> None:
     metadata = make_metadata()
-    network = AttentionVote(**metadata["model"], proposal_source="fps")
+    network = AttentionVote.from_arguments(metadata["model"] | {"proposal_source": "fps"})
     assert used_otherwise(network, metadata, None, 1.0)["peak_threshold"] == 1.0
     with pytest.raises(ValueError, match=r"must be at most 1, the heat of all farthest-point proposals, got 1\.5"):
         used_otherwise(network, metadata, None, 1.5)

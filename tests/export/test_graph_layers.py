@@ -17,6 +17,7 @@ from attentionvote.model.fusion import VoteBranch
 from attentionvote.model.layers import Residual, RowNorm, shared_mlp
 from attentionvote.model.proposals import heatmap_reference
 from attentionvote.model.refinement import Refiner
+from attentionvote.model.settings import RefinementSettings
 
 CLOSE = {"atol": 2e-6, "rtol": 1e-5}
 
@@ -65,7 +66,9 @@ def test_set_abstraction(width_in: int, widths: list[int]) -> None:
 @pytest.mark.parametrize("stray", [0.0, 1e9])
 def test_refiner(points: int, stray: float) -> None:
     """More and fewer points in a box than are looked at, none, some at its faces, one far behind everything."""
-    layer = trained(Refiner(0.3, [[-0.1, -0.04, -0.02], [0.05, 0.04, 0.08]], points, [16, 8], [16], 4))
+    layer = trained(
+        Refiner(RefinementSettings(points, (16, 8), (16,)), 0.3, [[-0.1, -0.04, -0.02], [0.05, 0.04, 0.08]], 4)
+    )
     nn.init.normal_(layer.output.weight, std=0.1)
     xyz, center = torch.rand(1, 300, 3) * 0.4, torch.rand(9, 3) * 0.4
     xyz[0, 7, 2] += stray

@@ -17,10 +17,11 @@ from attentionvote.export import held_out
 from attentionvote.export.checkpoint_card import model_card
 from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
+from attentionvote.section import read
 from attentionvote.simulation import cycle
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
-from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
+from attentionvote.simulation.scene_spec import SimulationSettings, scene_set_directory, scene_set_specs
 
 CAMERA = {"width": 344, "height": 257, "fx": 567.0, "fy": 567.0, "cx": 172.0, "cy": 128.5}
 SETTINGS: dict[str, Any] = {
@@ -46,7 +47,7 @@ def root(part: Part, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cycle, "convex_hulls", lambda p, *_: (p.vertices[ConvexHull(p.vertices).vertices],))
-        for spec in scene_set_specs(part, SETTINGS).values():
+        for spec in scene_set_specs(part, read(SimulationSettings, SETTINGS)).values():
             directory = scene_set_directory(folder / "scenes", part.name, spec)
             generate_scene_set(part, spec, directory, progress=False)
     return folder

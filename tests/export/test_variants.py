@@ -68,7 +68,7 @@ def bricks(part: Part, layout: Layout, seed: int) -> Batch:
 def trained(part: Part, arguments: dict[str, Any], rotation: RotationLoss) -> AttentionVote:
     """The network after two steps, which every weight has felt."""
     torch.manual_seed(0)
-    model = AttentionVote(**arguments).train()
+    model = AttentionVote.from_arguments(arguments).train()
     weights = {"vote": 1.0, "center": 1.0, "rotation": 1.0, "confidence": 1.0, "refined": 1.0}
     loss = AttentionVoteLoss(part, weights, LossSettings(rotation, assignment=1.0, confidence=model.confidence))
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
@@ -98,7 +98,7 @@ def test_every_combination_trains(
     model = trained(part, make_metadata()["model"] | SMALL | choices, rotation).eval()
     batch = bricks(part, model.layout, 9)
     with torch.no_grad():
-        answer = model(batch.points, batch.normals, batch.found)
+        answer = model(batch.points, batch.normals, batch.neighborhoods)
     assert all(value.isfinite().all() for value in answer)
     assert (answer.peak_heat > 0).any(1).all()
 

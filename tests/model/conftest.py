@@ -10,33 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_network import tiny_network, with_random_norms
 from torch import Tensor
 
 from attentionvote.geometry import native
 from attentionvote.model.network import AttentionVote
-
-SMALL: dict[str, Any] = {
-    "diameter": 0.1,
-    "box": [[-0.03, -0.03, -0.05], [0.03, 0.03, 0.05]],
-    "centers": [48, 24, 12, 6],
-    "neighbors": [8, 8, 4, 4],
-    "widths": [[8, 16], [16, 16], [16, 16], [16, 16]],
-    "propagation": [16, 16],
-    "residual": True,
-    "radius_fraction": 0.2,
-    "voxel_fraction": 0.15625,
-    "voting": [16],
-    "vote_rotation": True,
-    "proposals": 4,
-    "peak_window": 2,
-    "center_seed": "mean",
-    "gathered": 4,
-    "fusion": [16, 16],
-    "head": [16],
-    "rotation": "six",
-    "confidence": "quality",
-    "refinement": {"points": 16, "widths": [8, 16], "head": [16]},
-}
 
 
 @pytest.fixture(scope="session")
@@ -54,15 +32,7 @@ def kernels() -> dict[str, ctypes.CDLL]:
 
 def small_network(seed: int = 0, **changes: Any) -> AttentionVote:
     """A few thousand random weights, in evaluation with norms that are not the identity."""
-    torch.manual_seed(seed)
-    model = AttentionVote(**(SMALL | changes))
-    for module in model.modules():
-        if isinstance(module, torch.nn.BatchNorm1d):
-            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
-            torch.nn.init.normal_(module.bias, std=0.2)
-            torch.nn.init.normal_(module.running_mean, std=0.2)
-            torch.nn.init.uniform_(module.running_var, 0.5, 2.0)
-    return model.eval()
+    return with_random_norms(tiny_network(seed, **changes))
 
 
 def random_cloud(seed: int, samples: int = 1, count: int = 96) -> tuple[Tensor, Tensor]:
@@ -78,11 +48,6 @@ def random_cloud(seed: int, samples: int = 1, count: int = 96) -> tuple[Tensor, 
 @pytest.fixture(scope="session")
 def make_network() -> Callable[..., AttentionVote]:
     return small_network
-
-
-@pytest.fixture(scope="session")
-def small_arguments() -> dict[str, Any]:
-    return SMALL
 
 
 @pytest.fixture(scope="session")

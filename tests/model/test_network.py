@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,28 +12,31 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from tiny_network import TINY_ARGUMENTS
 from torch import Tensor
 
 from attentionvote.model.neighborhoods import find_neighborhoods
-from attentionvote.model.network import AttentionVote
+from attentionvote.model.network import AttentionVote, PoseChannels
 from attentionvote.model.proposals import Peaks, gather_votes
+from attentionvote.model.settings import NetworkSettings
+from attentionvote.section import read
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
 BOX = [[-0.03, -0.03, -0.05], [0.03, 0.03, 0.05]]
 
 
-def preset(repository: Path, name: str) -> dict[str, Any]:
-    """The constructor's arguments in ``conf/model/NAME.yaml``, without Hydra."""
+def preset(repository: Path, name: str) -> NetworkSettings:
+    """The settings in ``conf/model/NAME.yaml``, without Hydra."""
     scales = {"base_radius": None, "voxel_size": None}
     config = OmegaConf.create({"object": scales, "model": OmegaConf.load(repository / f"conf/model/{name}.yaml")})
-    arguments = OmegaConf.to_container(config.model, resolve=True)
-    assert isinstance(arguments, dict)
-    return arguments
+    values = OmegaConf.to_container(config.model, resolve=True)
+    assert isinstance(values, dict)
+    return read(NetworkSettings, {str(name): value for name, value in values.items()})
 
 
 def test_the_papers_preset_has_the_papers_sizes(repository: Path) -> None:
-    model = AttentionVote(0.14, BOX, **preset(repository, "paper"))
+    model = AttentionVote(preset(repository, "paper"), 0.14, BOX)
     assert model.layout.centers == (2048, 1024, 512, 256)
     np.testing.assert_allclose(model.layout.radii, np.array([1, 2, 3, 6]) * 0.014)
     assert (model.layout.seeds, model.backbone.width) == (1024, 256)
@@ -55,7 +57,7 @@ def test_the_papers_preset_has_the_papers_sizes(repository: Path) -> None:
 
 def test_the_papers_preset_answers_one_cloud(repository: Path, make_cloud: Callable) -> None:
     torch.manual_seed(0)
-    model = AttentionVote(0.14, BOX, **preset(repository, "paper")).eval()
+    model = AttentionVote(preset(repository, "paper"), 0.14, BOX).eval()
     with torch.no_grad():
         votes = model.cast_votes(*(cloud := make_cloud(0, 1, 2100)), batch_of(cloud[0], model))
         predictions = model(*cloud)
@@ -184,19 +186,25 @@ def test_confidence_is_clamped_or_a_probability(make_network: Callable) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"rotation": "euler"}, "rotation must be quaternion or six, got 'euler'"),
-        ({"confidence": "softmax"}, "confidence must be exponential or quality, got 'softmax'"),
-        ({"center_seed": "median"}, "center_seed must be voxel or mean, got 'median'"),
-        ({"proposal_source": "nms"}, "proposal_source must be heatmap or fps, got 'nms'"),
-        ({"fusion_kind": "max"}, "fusion_kind must be aml or amx or pn, got 'max'"),
+        ({"rotation": "euler"}, "rotation must be one of quaternion, six; got 'euler'"),
+        ({"confidence": "softmax"}, "confidence must be one of exponential, quality; got 'softmax'"),
+        ({"center_seed": "median"}, "center_seed must be one of voxel, mean; got 'median'"),
+        ({"proposal_source": "nms"}, "proposal_source must be one of heatmap, fps; got 'nms'"),
+        ({"fusion_kind": "max"}, "fusion_kind must be one of aml, amx, pn; got 'max'"),
+        ({"center": 1}, "there is no setting 'center', did you mean 'centers'"),
         ({"centers": [48, 24, 12]}, "a layout must have four levels of centers, neighbors and radii, got 3, 4 and 4"),
     ],
 )
-def test_unknown_choices_are_refused(small_arguments: dict[str, Any], changes: dict, words: str) -> None:
-    # Without the check of the annotations, which the tests alone have and which comes first.
-    initialise = inspect.unwrap(AttentionVote.__init__)
+def test_impossible_arguments_are_refused(changes: dict, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        initialise(AttentionVote.__new__(AttentionVote), **(small_arguments | changes))
+        AttentionVote.from_arguments(TINY_ARGUMENTS | changes)
+
+
+def test_channels_of_the_head_follow_each_other_without_gap() -> None:
+    channels = PoseChannels.of(rotation_size=6, classes=2)
+    slices = (channels.offset, channels.rotation, channels.class_logits)
+    assert [i for s in slices for i in range(s.start, s.stop)] + [channels.score] == list(range(12))
+    assert channels.width == 12
 
 
 def spheres() -> tuple[Tensor, Tensor]:

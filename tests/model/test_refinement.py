@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from attentionvote.model.refinement import Refiner, points_in_box, points_in_box_reference
+from attentionvote.model.settings import RefinementSettings
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
@@ -62,7 +63,7 @@ def test_more_points_wanted_than_there_are_repeat_in_turn(make_cloud: Callable) 
 @pytest.fixture
 def refiner() -> Refiner:
     torch.manual_seed(0)
-    module = Refiner(0.1, BOX.tolist(), 32, [16, 24], [16], context=5).eval()
+    module = Refiner(RefinementSettings(32, (16, 24), (16,)), 0.1, BOX.tolist(), context=5).eval()
     nn.init.normal_(module.output.weight, std=0.3)
     return module
 
@@ -73,7 +74,7 @@ def test_refiner_looks_at_the_box_with_a_margin_of_six_percent_of_the_diameter(r
 
 def test_a_new_refiner_changes_next_to_nothing(make_cloud: Callable) -> None:
     torch.manual_seed(0)
-    fresh = Refiner(0.1, BOX.tolist(), 32, [16, 24], [16], context=5).eval()
+    fresh = Refiner(RefinementSettings(32, (16, 24), (16,)), 0.1, BOX.tolist(), context=5).eval()
     points, normals = make_cloud(0, 1, 60)
     center, rotation = poses(0, 4)
     out = fresh(points, normals, torch.zeros(4, dtype=torch.long), center, rotation, torch.randn(4, 5))
@@ -85,7 +86,7 @@ def test_a_new_refiner_changes_next_to_nothing(make_cloud: Callable) -> None:
 @given(seed=st.integers(0, 2**31))
 def test_corrections_move_with_the_scene(make_cloud: Callable, seed: int) -> None:
     torch.manual_seed(0)
-    module = Refiner(0.1, BOX.tolist(), 64, [16, 24], [16], context=5).eval()
+    module = Refiner(RefinementSettings(64, (16, 24), (16,)), 0.1, BOX.tolist(), context=5).eval()
     nn.init.normal_(module.output.weight, std=0.3)
     points, normals = make_cloud(seed, 1, 60)
     center, rotation = poses(seed, 4)

@@ -72,7 +72,7 @@ def test_every_row_has_a_contest_and_a_name_of_its_own() -> None:
             ROOT / "src/attentionvote/workflows/speed" / f"{module}.py"
         ).read_text()  # not imported: onnxruntime and the exporter are slow
         assert f"\ndef {function}(material: Material" in text, row.name
-    assert bench_rows.chosen("normals, ball-query") == [bench_rows.ROWS[1], bench_rows.ROWS[2]]
+    assert bench_rows.select_rows("normals, ball-query") == [bench_rows.ROWS[1], bench_rows.ROWS[2]]
 
 
 def test_unequal_results_are_an_error_and_no_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from attentionvote.workflows.speed.report import keep, kept_rows, markdown
+from attentionvote.workflows.speed.report import keep, markdown, stored_rows
 
 
 def measured(met: bool | None, commit: str, **changes: Any) -> dict[str, Any]:
@@ -49,10 +49,10 @@ def test_rows_of_several_runs_stand_in_one_table() -> None:
 
 def test_what_was_measured_is_kept_beside_the_page(tmp_path: Path) -> None:
     page = tmp_path / "docs" / "page.md"
-    assert kept_rows(page) == {}
+    assert stored_rows(page) == {}
     keep(page, {"a": {"ms": 1.0}})
-    assert kept_rows(page) == {"a": {"ms": 1.0}}
+    assert stored_rows(page) == {"a": {"ms": 1.0}}
     (page.with_suffix("") / "speed.json").write_text("{")
     with pytest.raises(ValueError, match="must be what `make bench` wrote, got a damaged file: mend or remove it"):
-        kept_rows(page)
+        stored_rows(page)
     assert (tmp_path / "docs" / "page" / "speed.json").is_file()

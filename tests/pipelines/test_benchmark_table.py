@@ -99,13 +99,13 @@ def test_an_unknown_detector_and_a_name_twice_are_refused(small: dict[str, Any])
 
 def test_objects_and_rows_are_chosen_by_name(small: dict[str, Any]) -> None:
     table = BenchmarkTable.of("T", small)
-    assert table.chosen(None, None) == (("brick", "gear"), table.measured)
-    objects, rows = table.chosen("gear", " PPF,")
+    assert table.select(None, None) == (("brick", "gear"), table.measured)
+    objects, rows = table.select("gear", " PPF,")
     assert (objects, [row.name for row in rows]) == (("gear",), ["PPF"])
     with pytest.raises(ValueError, match="objects must be among those of T, brick, gear; got 'rod'"):
-        table.chosen("rod", None)
+        table.select("rod", None)
     with pytest.raises(ValueError, match="rows must be among those of T, ours, PPF; got 'theirs'"):
-        table.chosen(None, "theirs")
+        table.select(None, "theirs")
 
 
 def test_titles_and_means() -> None:

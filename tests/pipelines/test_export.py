@@ -14,6 +14,7 @@ from typing import Any
 import export
 import pytest
 import torch
+from tiny_network import EXPORT_CHANGES, TINY_ARGUMENTS
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -54,14 +55,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = python("generate.py", *SCENES, "splits=[test]", "workers=1", folder=folder)
     assert done.returncode == 0, done.stderr
     part = load_part("brick", "builtin:brick")
-    network: dict[str, Any] = {
-        "diameter": float(part.diameter), "box": [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()],
-        "centers": [64, 32, 16, 8], "neighbors": [16, 8, 8, 4], "widths": [[8, 16]] + [[16, 16]] * 3,
-        "propagation": [16, 16], "residual": True, "radius_fraction": 0.2, "voxel_fraction": 0.2, "voting": [16],
-        "proposals": 8, "gathered": 8, "fusion": [16, 16], "head": [16], "rotation": "six", "confidence": "quality",
-        "center_seed": "mean", "vote_rotation": True, "merge_fraction": 0.08,
-        "refinement": {"points": 24, "widths": [8, 16], "head": [16]}, "refinement_steps": 1,
-    }  # fmt: skip
+    box = [part.vertices.min(0).tolist(), part.vertices.max(0).tolist()]
+    network = TINY_ARGUMENTS | EXPORT_CHANGES | {"diameter": float(part.diameter), "box": box, "refinement_steps": 1}
     torch.manual_seed(0)
     scenes = SceneSet.open(next((folder / "data" / "scenes" / "brick").glob("test-*")))
     metadata = {
@@ -75,7 +70,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "peak_threshold": 0.05, "confidence_threshold": 0.1, "data": {"test": scenes.digest}, "test": {"ap_10": 0.1},
     }  # fmt: skip
     training = folder / "outputs" / "train" / "brick" / "0123456789ab"
-    save_trained(AttentionVote(**network).eval(), metadata, training / "model.ckpt")
+    save_trained(AttentionVote.from_arguments(network).eval(), metadata, training / "model.ckpt")
     (training / "result.json").write_text(json.dumps({"run_id": "feed" * 8, "commit": "c" * 40}), encoding="utf-8")
     return folder
 

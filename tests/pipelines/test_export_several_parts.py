@@ -66,7 +66,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }  # fmt: skip
     training = folder / "outputs" / "train" / "industrial" / "0123456789ab"
     plain = json.loads(json.dumps(metadata))
-    save_trained(AttentionVote(**network).eval(), plain, training / "model.ckpt")
+    save_trained(AttentionVote.from_arguments(network).eval(), plain, training / "model.ckpt")
     (training / "result.json").write_text(json.dumps({"run_id": "", "commit": ""}), encoding="utf-8")
     return folder
 

@@ -107,7 +107,7 @@ def test_every_number_has_bounds_on_both_sides_and_beyond_them_a_sentence(verb: 
         ("loss.settings.rows_per_scene=0", "loss.settings.rows_per_scene must be at least 1 and at most 100000; got 0"),
         ("loss.settings.assignment=0", "loss.settings.assignment must be greater than 0 and at most 10; got 0"),
         ("simulation.bin.jitter=0.7", "simulation.bin.jitter must be at least 0 and at most 0.5; got 0.7"),
-        ("simulation.drop.speed=50", "simulation.drop.speed must be at least 0 and at most 5; got 50"),
+        ("simulation.drop.speed=50", "simulation.drop.speed must be greater than 0 and at most 5; got 50"),
         ("simulation.drop.hull_vertices=4",
          "simulation.drop.hull_vertices must be at least 8 and at most 256; got 4"),
         ("model.fusion_kind=amk", "model.fusion_kind must be one of aml, amx, pn; got 'amk', did you mean 'amx'?"),

@@ -23,7 +23,7 @@ from tiny_training import TINY_TRAINING
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.workflows.train.processes import Place, first_speaks, refuse_grid
+from attentionvote.workflows.train.processes import TrainingProcess, first_speaks, refuse_grid
 from attentionvote.workflows.train.settings import TrainSettings
 from attentionvote.workflows.train.torchrun import _cause
 
@@ -87,21 +87,21 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[str]], dic
 
 def test_torchrun_s_environment_is_understood(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # else it is set for the rest of the session
-    assert Place.of({}) == Place.of({"WORLD_SIZE": "1", "RANK": "0"}) == Place()
-    place = Place.of(TORCHRUN_SAYS)
+    assert TrainingProcess.of({}) == TrainingProcess.of({"WORLD_SIZE": "1", "RANK": "0"}) == TrainingProcess()
+    place = TrainingProcess.of(TORCHRUN_SAYS)
     assert (place.rank, place.processes, place.local_rank, place.local_processes) == (1, 4, 1, 2)
     assert place.name == "process 2 of 4"
     assert place.trainer_arguments()["num_nodes"] == 2
-    assert Place().trainer_arguments() == {"devices": 1}
+    assert TrainingProcess().trainer_arguments() == {"devices": 1}
     for name in ("RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID"):
         with pytest.raises(ConfigurationError, match=f"must be started by torchrun, but WORLD_SIZE is 4 and {name} is"):
-            Place.of({k: v for k, v in TORCHRUN_SAYS.items() if k != name})
+            TrainingProcess.of({k: v for k, v in TORCHRUN_SAYS.items() if k != name})
     with pytest.raises(ConfigurationError, match="2 on this one are no equal share of 3"):
-        Place.of(TORCHRUN_SAYS | {"WORLD_SIZE": "3"})
+        TrainingProcess.of(TORCHRUN_SAYS | {"WORLD_SIZE": "3"})
 
 
 def test_what_cannot_be_shared_is_refused() -> None:
-    place, scenes = Place.of(TORCHRUN_SAYS), {"train": 100, "val": 7, "test": 4}
+    place, scenes = TrainingProcess.of(TORCHRUN_SAYS), {"train": 100, "val": 7, "test": 4}
     place.check(16, scenes)
     for batch, nearest in ((15, 16), (17, 16), (1, 4)):
         with pytest.raises(ValueError, match=f"multiple of their number, 4; got {batch}, {nearest} is the nearest"):
@@ -110,7 +110,7 @@ def test_what_cannot_be_shared_is_refused() -> None:
         place.check(16, scenes | {"test": 3})
     with pytest.raises(ConfigurationError, match=r"a grid \(-m\) must be run by one process, got 4"):
         refuse_grid(place, ["train.py", "-m", "seed=1,2"])
-    refuse_grid(Place(), ["train.py", "-m", "seed=1,2"])
+    refuse_grid(TrainingProcess(), ["train.py", "-m", "seed=1,2"])
     refuse_grid(place, ["train.py", "seed=1"])
 
 
@@ -152,7 +152,7 @@ def test_what_a_signal_ended_is_the_cause_whoever_is_seen_first(exit_codes: tupl
 def test_another_process_only_says_why_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     broken = RuntimeError("[../gloo/transport/tcp/pair.cc:547] Connection closed by peer [127.0.0.1]:31")
 
-    def said(place: Place, error: Exception, raised: type[Exception], message: str) -> str:
+    def said(place: TrainingProcess, error: Exception, raised: type[Exception], message: str) -> str:
         terminal = io.StringIO()
 
         def fail() -> None:
@@ -172,16 +172,16 @@ def test_another_process_only_says_why_it_failed(monkeypatch: pytest.MonkeyPatch
         assert ("progress" in terminal.getvalue()) == (place.rank == 0)
         return terminal.getvalue().replace("progress\n", "")
 
-    first, second = Place(0, 2, 0, 2), Place(1, 2, 1, 2)
+    first, second = TrainingProcess(0, 2, 0, 2), TrainingProcess(1, 2, 1, 2)
     damaged = ValueError("cloud 3 is damaged")
     assert said(second, damaged, ValueError, "cloud 3") == "train: process 2 of 2: cloud 3 is damaged\n"
     assert said(first, damaged, ValueError, "cloud 3") == ""  # the verb says it, as with one process
     for place in (first, second):
         assert said(place, broken, ConnectionError, "another process of this training has ended; run the same") == ""
-    assert said(Place(), broken, RuntimeError, "closed by peer") == ""
+    assert said(TrainingProcess(), broken, RuntimeError, "closed by peer") == ""
     elsewhere = ConfigurationError("object bunny: no mesh")
     assert said(second, elsewhere, ConfigurationError, "bunny") == ""
-    assert said(Place(8, 16, 0, 8), elsewhere, ConfigurationError, "bunny") == (
+    assert said(TrainingProcess(8, 16, 0, 8), elsewhere, ConfigurationError, "bunny") == (
         "train: process 9 of 16: object bunny: no mesh\n"
     )
 

@@ -43,7 +43,7 @@ def test_a_good_first_model_passes_every_gate(card):
     assert list(gates) == [
         "scenes", "floor ap_10", "latency", "parity", "commit", "data", "config", "versions", "signature",
     ]  # fmt: skip
-    assert gates["parity"].found == "CPU 0.0007 mm, 0.0008 degrees"
+    assert gates["parity"].finding == "CPU 0.0007 mm, 0.0008 degrees"
     assert str(gates["latency"]) == "holds: p95 at most 500 ms; 300 ms (p50 200)"
 
 
@@ -56,14 +56,14 @@ def test_too_small_a_set_proves_nothing(card, scenes, holds):
 def test_the_floor_is_inclusive_and_shows_the_interval(card, ap, holds):
     gate = judged(card, evidence(ap, 0.02))["floor ap_10"]
     assert gate.holds is holds
-    assert gate.found == f"{ap:.4f} ({ap - 0.019:.3f} to {ap + 0.019:.3f})"
+    assert gate.finding == f"{ap:.4f} ({ap - 0.019:.3f} to {ap + 0.019:.3f})"
 
 
 def test_a_figure_that_was_not_measured_fails(card):
     rules = replace(RULES, floors={"ap_7": 0.1}, margins={"ap_7": 0.1})
     gates = judged(card, champion=evidence(0.9), rules=rules)
-    assert (gates["floor ap_7"].holds, gates["floor ap_7"].found) == (False, "it was not measured")
-    assert (gates["champion ap_7"].holds, gates["champion ap_7"].found) == (False, "it was not measured for both")
+    assert (gates["floor ap_7"].holds, gates["floor ap_7"].finding) == (False, "it was not measured")
+    assert (gates["champion ap_7"].holds, gates["champion ap_7"].finding) == (False, "it was not measured for both")
 
 
 def test_no_worse_than_the_champion_means_that_a_larger_loss_is_excluded(card):
@@ -73,7 +73,7 @@ def test_no_worse_than_the_champion_means_that_a_larger_loss_is_excluded(card):
     # The same mean with a spread of the difference beyond the margin: not excluded.
     unsure = judged(card, evidence(0.95, 0.05), evidence(0.95, 0.0))["champion ap_10"]
     assert not unsure.holds
-    assert unsure.found == "0.9500 +0.0000 (-0.0475 to +0.0475)"
+    assert unsure.finding == "0.9500 +0.0000 (-0.0475 to +0.0475)"
 
 
 def test_a_better_model_passes_whatever_the_margin(card):
@@ -99,7 +99,7 @@ def test_the_latency_budget(card, p95, holds):
 def test_the_proof_is_judged_again_whatever_limits_the_export_had(card, record, said):
     gate = judged(replace(card, parity=record))["parity"]
     assert not gate.holds
-    assert gate.found.startswith(said)
+    assert gate.finding.startswith(said)
 
 
 DIRTY, OTHER = f"{COMMIT}+dirty", "f" * 40
@@ -125,20 +125,20 @@ def test_the_commit_is_the_runs_own_and_clean_or_its_changes_are_recorded(
 ):
     origin = replace(ORIGIN, commits=tuple(commits), has_changes=has_changes)
     gate = judged(replace(card, commit=said), origin=origin)["commit"]
-    assert (gate.holds, gate.found) == (holds, found)
+    assert (gate.holds, gate.finding) == (holds, found)
 
 
 def test_missing_provenance_fails_one_gate_each(card):
-    assert judged(replace(card, data={"train": "1", "test": "3"}))["data"].found == "no val digest"
-    assert judged(replace(card, versions={}))["versions"].found == "no attentionvote"
-    assert judged(replace(card, run_id=""))["config"].found == "the card names no run"
-    assert judged(card, origin=replace(ORIGIN, found=False))["config"].found == "run feedfeed is not in the store"
-    assert judged(card, origin=replace(ORIGIN, has_config=False))["config"].found == "run feedfeed has no config.yaml"
-    assert judged(card, origin=replace(ORIGIN, signed_by=""))["signature"].found == "no signature was verified"
+    assert judged(replace(card, data={"train": "1", "test": "3"}))["data"].finding == "no val digest"
+    assert judged(replace(card, versions={}))["versions"].finding == "no attentionvote"
+    assert judged(replace(card, run_id=""))["config"].finding == "the card names no run"
+    assert judged(card, origin=replace(ORIGIN, has_run=False))["config"].finding == "run feedfeed is not in the store"
+    assert judged(card, origin=replace(ORIGIN, has_config=False))["config"].finding == "run feedfeed has no config.yaml"
+    assert judged(card, origin=replace(ORIGIN, signed_by=""))["signature"].finding == "no signature was verified"
     for card_, origin, name in (
         (replace(card, data={}), ORIGIN, "data"),
         (replace(card, versions={}), ORIGIN, "versions"),
-        (replace(card, run_id=""), replace(ORIGIN, found=False), "config"),
+        (replace(card, run_id=""), replace(ORIGIN, has_run=False), "config"),
         (card, replace(ORIGIN, signed_by=""), "signature"),
     ):
         assert [gate.name for gate in judged(card_, origin=origin).values() if not gate.holds] == [name]

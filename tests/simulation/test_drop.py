@@ -139,7 +139,7 @@ def test_the_bin_grows_for_bulky_parts_only(bracket: Part) -> None:
         (lambda: DropSettings(timestep=0.02), "^timestep must be at least 0.0001 and at most 0.01; got 0.02"),
         (lambda: DropSettings(contact_time=0.007), r"drop contact_time must be at least two time steps \(0.008 s\)"),
         (lambda: DropSettings(friction=(0.6, 0.2)), "drop friction must be a range within 0..2"),
-        (lambda: DropSettings(speed=-1), "^speed must be at least 0 and at most 5; got -1"),
+        (lambda: DropSettings(speed=-1), "^speed must be greater than 0 and at most 5; got -1"),
         (lambda: DropSettings(timeout=0.1), "^timeout must be greater than 0.25 and at most 30; got 0.1"),
     ],
 )

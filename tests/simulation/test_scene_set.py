@@ -164,7 +164,7 @@ def test_an_interrupted_set_is_not_opened_and_goes_on(
 SCRIPT = """
 import pickle, sys
 from pathlib import Path
-from attentionvote.simulation import scene_set
+from attentionvote.simulation import cycle, scene_set
 if __name__ == "__main__":
     part, hulls, spec, directory = pickle.loads(Path(sys.argv[1]).read_bytes())
     cycle.convex_hulls = lambda *_: hulls

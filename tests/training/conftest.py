@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_network import LOSS_CHANGES, tiny_network
 
 from attentionvote.data.samples import Batch, collate
 from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion
@@ -44,28 +45,6 @@ SYMMETRIES = {
     "revolution, tilted": Symmetry("revolution", TILTED),
     "revolution, flip": Symmetry("revolution", flip=True),
     "revolution, flip, tilted": Symmetry("revolution", TILTED, flip=True),
-}
-LOSS_NETWORK: dict[str, Any] = {
-    "diameter": 0.1,
-    "box": [[-0.02, -0.01, -0.045], [0.02, 0.01, 0.045]],
-    "centers": [64, 48, 16, 8],
-    "neighbors": [8, 8, 4, 4],
-    "widths": [[16, 32], [32, 32], [32, 32], [32, 32]],
-    "propagation": [32, 32],
-    "residual": True,
-    "radius_fraction": 0.2,
-    "voxel_fraction": 0.055,
-    "voting": [32],
-    "vote_rotation": True,
-    "peak_window": 2,
-    "center_seed": "mean",
-    "proposals": 8,
-    "gathered": 8,
-    "fusion": [32, 32],
-    "head": [32],
-    "rotation": "six",
-    "confidence": "quality",
-    "refinement": {"points": 32, "widths": [16, 32], "head": [32]},
 }
 
 
@@ -115,8 +94,7 @@ def scene_sample(seed: int, instances: int, visible: float = 1.0, count: int = 1
 
 
 def loss_network(**changes: Any) -> AttentionVote:
-    torch.manual_seed(0)
-    return AttentionVote(**(LOSS_NETWORK | changes))
+    return tiny_network(**(LOSS_CHANGES | changes))
 
 
 # Functions as fixtures of the session: test modules cannot import each other, and hypothesis wants no other scope.

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from tiny_network import BRICK_CHANGES, TINY_ARGUMENTS, tiny_network
 
 from attentionvote.model.network import AttentionVote
 from attentionvote.training.checkpoint import (
@@ -24,29 +25,10 @@ from attentionvote.training.checkpoint import (
 )
 from attentionvote.training.checkpoint_writer import AtomicCheckpoints
 
-ARGUMENTS: dict[str, Any] = {
-    "diameter": 0.075,
-    "box": [[-0.03, -0.02, -0.01], [0.03, 0.02, 0.01]],
-    "centers": [48, 24, 12, 6],
-    "neighbors": [8, 8, 4, 4],
-    "widths": [[8, 16], [16, 16], [16, 16], [16, 16]],
-    "propagation": [16, 16],
-    "residual": True,
-    "radius_fraction": 0.2,
-    "voxel_fraction": 0.15,
-    "voting": [16],
-    "proposals": 6,
-    "gathered": 4,
-    "fusion": [16, 16],
-    "head": [16],
-    "rotation": "six",
-    "confidence": "quality",
-    "refinement": {"points": 16, "widths": [8, 16], "head": [16]},
-}
 METADATA: dict[str, Any] = {
     "format": FORMAT,
     "version": "0.1.0",
-    "model": ARGUMENTS,
+    "model": TINY_ARGUMENTS | BRICK_CHANGES,
     "part": {"name": "brick", "diameter": 0.075, "digest": "abc", "symmetry": {"kind": "none"}},
     "points": 128,
     "confidence_threshold": 0.35,
@@ -55,8 +37,7 @@ METADATA: dict[str, Any] = {
 
 @pytest.fixture
 def model() -> AttentionVote:
-    torch.manual_seed(1)
-    return AttentionVote(**ARGUMENTS).eval()
+    return tiny_network(1, **BRICK_CHANGES).eval()
 
 
 @pytest.fixture

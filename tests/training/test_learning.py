@@ -37,7 +37,7 @@ def test_a_small_network_learns_one_scene_of_three_instances(
         history.append({k: v.item() for k, v in terms.items()})
     model.eval()
     with torch.no_grad():
-        result = scene_results(model(batch.points, batch.normals, batch.found), batch, peak_threshold=0.4)
+        result = scene_results(model(batch.points, batch.normals, batch.neighborhoods), batch, peak_threshold=0.4)
     assert history[-1]["vote"] < 0.2 * history[0]["vote"]
     # The first values of the proposals' terms are those of step 40.
     assert history[-1]["refined"] < 0.5 * history[40]["refined"]

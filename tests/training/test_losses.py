@@ -234,14 +234,14 @@ def one_place(batch: Batch, model: AttentionVote) -> Batch:
     """All points of every sample at one place."""
     points = torch.full_like(batch.points, 0.25)
     found = [find_neighborhoods(p.numpy(), model.layout) for p in points]
-    return batch._replace(points=points, found=type(found[0]).stack(found))
+    return batch._replace(points=points, neighborhoods=type(found[0]).stack(found))
 
 
 def lonely(batch: Batch, model: AttentionVote) -> Batch:
     """Points so far apart that every ball holds one."""
     points = batch.points * 100
     found = [find_neighborhoods(p.numpy(), model.layout) for p in points]
-    return batch._replace(points=points, found=type(found[0]).stack(found))
+    return batch._replace(points=points, neighborhoods=type(found[0]).stack(found))
 
 
 CASES = ["instances", "one instance", "no instance", "a sample without", "invisible", "one place", "lonely points"]
@@ -310,10 +310,10 @@ def test_rows_per_scene_bounds_what_is_trained_on(
             "loss weights must be among vote, vote_rotation, center, rotation, semantic, confidence, refined, "
             "got a, centre",
         ),
-        (lambda _: LossSettings(rotation="euler"), "rotation loss must be one of metric, .*, got 'euler'"),
+        (lambda _: LossSettings(rotation="euler"), "rotation must be one of metric, .*; got 'euler'"),
         (
             lambda _: LossSettings(confidence="none"),
-            "confidence loss must be exponential or quality, got 'none'",
+            "confidence must be one of exponential, quality; got 'none'",
         ),
     ],
 )

@@ -13,11 +13,11 @@ import pytest
 import torch
 import trimesh
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
+from tiny_network import BRICK_CHANGES, tiny_network
 from torch.utils.data import DataLoader
 
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
-from attentionvote.model.network import AttentionVote
 from attentionvote.part import Part
 from attentionvote.scene import Scene
 from attentionvote.training.losses import AttentionVoteLoss
@@ -26,28 +26,6 @@ from attentionvote.training.pictures import ScenePictures, picture_inputs
 from attentionvote.training.schedule import Schedule
 from attentionvote.training.settings import LossSettings
 
-ARGUMENTS: dict[str, Any] = {
-    "diameter": 0.075,
-    "box": [[-0.03, -0.02, -0.01], [0.03, 0.02, 0.01]],
-    "centers": [48, 24, 12, 6],
-    "neighbors": [8, 8, 4, 4],
-    "widths": [[8, 16], [16, 16], [16, 16], [16, 16]],
-    "propagation": [16, 16],
-    "residual": True,
-    "radius_fraction": 0.2,
-    "voxel_fraction": 0.15,
-    "voting": [16],
-    "vote_rotation": True,
-    "proposals": 6,
-    "peak_window": 2,
-    "center_seed": "mean",
-    "gathered": 4,
-    "fusion": [16, 16],
-    "head": [16],
-    "rotation": "six",
-    "confidence": "quality",
-    "refinement": {"points": 16, "widths": [8, 16], "head": [16]},
-}
 WEIGHTS = {
     "vote": 2.0,
     "vote_rotation": 0.5,
@@ -70,7 +48,7 @@ def bricks(brick: Part) -> Callable[..., Batch]:
     """A batch of scenes of ``count`` bricks seen from all sides."""
 
     def make(scenes: int = 3, count: int = 3, seed: int = 0) -> Batch:
-        rng, layout = np.random.default_rng(seed), AttentionVote(**ARGUMENTS).layout
+        rng, layout = np.random.default_rng(seed), tiny_network(**BRICK_CHANGES).layout
         samples = []
         for _ in range(scenes):
             place = np.array([0, 0, 0.5]) + rng.uniform(-0.1, 0.1, (count, 3))
@@ -94,8 +72,7 @@ def make_module(brick: Part) -> Callable[..., PoseTraining]:
     """A module with the same weights every time."""
 
     def make(network: dict[str, Any] | None = None, **settings: Any) -> PoseTraining:
-        torch.manual_seed(0)
-        model = AttentionVote(**(ARGUMENTS | (network or {})))
+        model = tiny_network(**(BRICK_CHANGES | (network or {})))
         loss = AttentionVoteLoss(brick, WEIGHTS, LossSettings())
         chosen = {
             "optimizer": "adamw", "learning_rate": 0.003, "weight_decay": 0.01, "peak_threshold": 0.0,

@@ -30,9 +30,9 @@ WEIGHTS = dict(zip(AttentionVoteLoss.TERMS, (2.0, 0.5, 1.0, 1.5, 0.1, 1.0, 1.2),
 
 def scenes_of(batch: Batch, chosen: range) -> Batch:
     keep = torch.tensor(chosen)
-    levels = (tuple(level[keep] for level in levels) for levels in batch.found[1:])
-    found = Neighborhoods(batch.found.order[keep], *levels)
-    return Batch(**{n: getattr(batch, n)[keep] for n in Batch._fields if n != "found"}, found=found)
+    levels = (tuple(level[keep] for level in levels) for levels in batch.neighborhoods[1:])
+    found = Neighborhoods(batch.neighborhoods.order[keep], *levels)
+    return Batch(**{n: getattr(batch, n)[keep] for n in Batch._fields if n != "neighborhoods"}, neighborhoods=found)
 
 
 def step(

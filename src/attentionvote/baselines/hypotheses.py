@@ -50,11 +50,11 @@ def apart(poses: Array, scores: Array, center: Array, distance: float) -> NDArra
     Two parts cannot be in one place, however they are turned.
     """
     centers = apply(poses, center[None])[:, 0]
-    kept: list[int] = []
+    separate: list[int] = []
     for i in np.argsort(-scores, kind="stable"):
-        if not kept or np.linalg.norm(centers[kept] - centers[i], axis=1).min() > distance:
-            kept.append(int(i))
-    return np.asarray(kept, dtype=np.int64)
+        if not separate or np.linalg.norm(centers[separate] - centers[i], axis=1).min() > distance:
+            separate.append(int(i))
+    return np.asarray(separate, dtype=np.int64)
 
 
 def fits(poses: Array, model: NDArray[np.float32], cloud: cKDTree, distance: float) -> Array:

@@ -107,8 +107,8 @@ class PpfDetector:
                 poses = self.refined(poses, cloud)
         if settings.score == "fit":
             scores = fits(poses, self._model, cKDTree(cloud[:, :3]), settings.fit_distance * diameter)
-        kept = apart(poses, scores, self._center, settings.separation * diameter)
-        return Detections(poses[kept], scores[kept])
+        separate = apart(poses, scores, self._center, settings.separation * diameter)
+        return Detections(poses[separate], scores[separate])
 
     def votes(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> tuple[Array, Array]:
         """What OpenCV's ``match`` answers: a pose ``(R, 4, 4)`` in metres and its votes ``(R,)`` a reference point."""
@@ -121,13 +121,13 @@ class PpfDetector:
         scene[0, :3] += np.where(extent < 0.01 * voxel, 0.01 * voxel, 0).astype(np.float32)
         cells = min(math.ceil(extent.max() / voxel), _MOST_CELLS)
         # Half a cell more: OpenCV cuts 1 / share down to a whole number.
-        found = self._matcher.match(
+        matches = self._matcher.match(
             self._scaled(scene), min(1.0, 1 / (self.settings.reference_step + 0.5)), 1 / (cells + 0.5)
         )
-        poses = np.array([np.asarray(pose.pose) for pose in found], dtype=np.float64).reshape(-1, 4, 4)
+        poses = np.array([np.asarray(pose.pose) for pose in matches], dtype=np.float64).reshape(-1, 4, 4)
         poses[:, :3, 3] /= self._unit
         good = np.isfinite(poses).all(axis=(1, 2))
-        votes = np.array([pose.numVotes for pose in found], dtype=np.float64)
+        votes = np.array([pose.numVotes for pose in matches], dtype=np.float64)
         return _rigid(poses[good]), votes[good]
 
     def refined(self, poses: Array, cloud: NDArray[np.float32]) -> Array:
@@ -160,11 +160,11 @@ def _surface(part: Part, count: int, rng: np.random.Generator) -> NDArray[np.flo
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
     area = np.linalg.norm(cross, axis=1)
-    chosen = rng.choice(len(area), size=count, p=area / area.sum())
+    faces = rng.choice(len(area), size=count, p=area / area.sum())
     u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    points = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
-    return np.concatenate([points, (cross[chosen] / area[chosen, None])], axis=1).astype(np.float32)
+    points = a[faces] + u * (b - a)[faces] + v * (c - a)[faces]
+    return np.concatenate([points, (cross[faces] / area[faces, None])], axis=1).astype(np.float32)
 
 
 def _checked(points: NDArray[np.floating], normals: NDArray[np.floating] | None) -> NDArray[np.float32]:

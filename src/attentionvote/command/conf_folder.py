@@ -25,11 +25,13 @@ def primary_groups(verb: str, conf: Path = CONF) -> dict[str, str | None]:
     """Group and choice of a verb's defaults list, those of other verbs' files that it includes among them."""
     primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
     assert isinstance(primary, dict)
-    found: dict[str, str | None] = {}
+    defaults: dict[str, str | None] = {}
     for item in primary.get("defaults", []):
         if isinstance(item, dict):
             for group, choice in item.items():
-                found[str(group).removeprefix("override ").removeprefix("optional ").split("@")[0].strip("/")] = choice
+                defaults[str(group).removeprefix("override ").removeprefix("optional ").split("@")[0].strip("/")] = (
+                    choice
+                )
         elif (conf / f"{item}.yaml").is_file():
-            found |= primary_groups(item, conf)
-    return found
+            defaults |= primary_groups(item, conf)
+    return defaults

@@ -82,10 +82,10 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
     """
     verb = settings.verb
     parsed = parse(overrides)
-    chosen = [o for o in parsed if o.input_line and (conf / o.key_or_group).is_dir()]
-    for override in chosen:
+    group_words = [o for o in parsed if o.input_line and (conf / o.key_or_group).is_dir()]
+    for override in group_words:
         _check_choice(override, conf)
-    values = [o for o in parsed if o not in chosen and o.key_or_group.split("/")[0].split(".")[0] != "hydra"]
+    values = [o for o in parsed if o not in group_words and o.key_or_group.split("/")[0].split(".")[0] != "hydra"]
     if values:
         base = _defaults(verb, tuple(str(o.input_line) for o in parsed if o not in values), conf, _state(conf))
         for override in values:
@@ -94,7 +94,7 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
     for override in values:
         key = override.key_or_group
         if not (override.is_add() or override.is_delete()):
-            check_types(settings, key, _select(base, key), _kept(final, override), base)
+            check_types(settings, key, _select(base, key), _final_value(final, override), base)
     try:
         return settings.of(final)
     except SettingError as error:
@@ -102,15 +102,15 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
 
 
 @lru_cache(maxsize=64)
-def _defaults(verb: str, chosen: tuple[str, ...], conf: Path, _: object) -> dict[str, Any]:
+def _defaults(verb: str, group_words: tuple[str, ...], conf: Path, _: object) -> dict[str, Any]:
     """What the values replace, not to be changed: a third of a second that a fleet of parts or a sweep pays once."""
-    return _plain(_compose(verb, chosen, conf))
+    return _plain(_compose(verb, group_words, conf))
 
 
 def _state(conf: Path) -> tuple[tuple[str, int, int], ...]:
     """What tells that a file of the configuration has changed, as a part does that is added."""
-    found = ((path, path.stat()) for path in sorted(conf.rglob("*.yaml")))
-    return tuple((str(path), facts.st_mtime_ns, facts.st_size) for path, facts in found)
+    stats = ((path, path.stat()) for path in sorted(conf.rglob("*.yaml")))
+    return tuple((str(path), facts.st_mtime_ns, facts.st_size) for path, facts in stats)
 
 
 def _compose(verb: str, overrides: Sequence[str], conf: Path) -> DictConfig:
@@ -169,9 +169,9 @@ def _check_key(override: Override, base: dict[str, Any], conf: Path) -> None:
     try:
         _select(base, key)
     except KeyError:
-        known = [k for k, _ in leaves(base)]
-        sections = {k.rsplit(".", n)[0] for k in known for n in range(1, k.count(".") + 1)}
-        hint = nearest(key, [*(g for g in groups(conf) if "." not in key), *known, *sorted(sections)])
+        keys = [k for k, _ in leaves(base)]
+        sections = {k.rsplit(".", n)[0] for k in keys for n in range(1, k.count(".") + 1)}
+        hint = nearest(key, [*(g for g in groups(conf) if "." not in key), *keys, *sorted(sections)])
         raise ConfigurationError(f"there is no setting {key!r}{hint}") from None
 
 
@@ -187,7 +187,7 @@ def _select(plain: Any, key: str) -> Any:
     return node
 
 
-def _kept(final: dict[str, Any], override: Override) -> Any:
+def _final_value(final: dict[str, Any], override: Override) -> Any:
     """The value that an override has in the end."""
     try:
         return _select(final, override.key_or_group)
@@ -208,8 +208,8 @@ def check_types(
     Args:
         values: of the settings, see ``setting.find``.
     """
-    known = find(settings, key, values)
-    nullable = known is not None and without_null(known.type)[1]
+    setting = find(settings, key, values)
+    nullable = setting is not None and without_null(setting.type)[1]
     if default is None or (value is None and nullable):
         return
     if isinstance(default, Mapping):

@@ -67,14 +67,14 @@ def command(
     if any(word in ("-h", "--help") for word in words):
         print(help_text(settings, conf))
         sys.exit(0)
-    with _one_sentence(verb):
-        said = [word for word in words if not word.startswith("-")]
+    with _reporting_errors(verb):
+        overrides = [word for word in words if not word.startswith("-")]
         flags = {word for word in words if word.startswith("-")}
-        machine = defaults(said) if defaults is not None else []
+        machine = defaults(overrides) if defaults is not None else []
         if not flags:
             _print_result(run, compose(settings, [*machine, *words], conf))
         elif flags <= {"-m", "--multirun"}:
-            run_grid(verb, said, machine, lambda job: compose(settings, job, conf), _configuring(check))
+            run_grid(verb, overrides, machine, lambda job: compose(settings, job, conf), _configuring(check))
         else:
             _with_hydra(settings, run, words, machine, conf)
     sys.exit(0)
@@ -148,28 +148,28 @@ def _with_hydra(
     import hydra
 
     def task(cfg: DictConfig) -> None:
-        with _one_sentence(settings.verb), configuring():
+        with _reporting_errors(settings.verb), configuring():
             composed: Any = OmegaConf.to_container(cfg, resolve=True)
             checked = settings.of(composed)
-        with _one_sentence(settings.verb):
+        with _reporting_errors(settings.verb):
             _print_result(run, checked)
 
-    own_defaults = {
+    hydra_defaults = {
         "hydra.run.dir": ".",
         "hydra.output_subdir": "null",
         "hydra/job_logging": "none",
         "hydra/hydra_logging": "none",
     }
-    given = {word.partition("=")[0] for word in words}
+    named = {word.partition("=")[0] for word in words}
     # argparse takes the overrides from one place only: ours go in front of the user's first.
-    place = next((i for i, word in enumerate(words) if "=" in word), len(words))
-    own = [*(f"{key}={value}" for key, value in own_defaults.items() if key not in given), *machine]
-    sys.argv = [sys.argv[0], *words[:place], *own, *words[place:]]
+    first = next((i for i, word in enumerate(words) if "=" in word), len(words))
+    inserted = [*(f"{key}={value}" for key, value in hydra_defaults.items() if key not in named), *machine]
+    sys.argv = [sys.argv[0], *words[:first], *inserted, *words[first:]]
     hydra.main(config_path=str(conf), config_name=settings.verb, version_base="1.3")(task)()
 
 
 @contextmanager
-def _one_sentence(verb: str) -> Iterator[None]:
+def _reporting_errors(verb: str) -> Iterator[None]:
     """Every exception becomes one sentence on stderr and an exit code."""
     try:
         yield

@@ -60,12 +60,12 @@ def run_grid(
         configurations.append(compose(job))
         if check is not None:
             check(configurations[-1])
-    said = " ".join(str(o.input_line) for o in parsed if o.is_sweep_override()) or " ".join(words)
-    parent = _open_parent(verb, said, jobs, configurations)
+    title = " ".join(str(o.input_line) for o in parsed if o.is_sweep_override()) or " ".join(words)
+    parent = _open_parent(verb, title, jobs, configurations)
     outcomes: list[Outcome] = []
     try:
         for index, job in enumerate(jobs):
-            log.info("%s %d of %d: %s", verb, index + 1, len(jobs), " ".join(_own(job, jobs)))
+            log.info("%s %d of %d: %s", verb, index + 1, len(jobs), " ".join(_distinct_words(job, jobs)))
             outcomes.append(_run_job(job, parent))
             if outcomes[-1].code == INTERRUPTED:
                 raise KeyboardInterrupt
@@ -92,7 +92,7 @@ def _run_job(job: Sequence[str], parent: Any) -> Outcome:
     return outcome
 
 
-def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurations: Sequence[VerbSettings]) -> Any:
+def _open_parent(verb: str, title: str, jobs: Sequence[Sequence[str]], configurations: Sequence[VerbSettings]) -> Any:
     """The run above the jobs; None for a verb that tracks nothing."""
     first = configurations[0].composed
     tracking = first.get("tracking", {})
@@ -108,10 +108,10 @@ def _open_parent(verb: str, said: str, jobs: Sequence[Sequence[str]], configurat
     run = open_group(
         tracking["store"],
         parts.pop() if len(parts) == 1 else SEVERAL,
-        f"{verb} {said}"[:250],
+        f"{verb} {title}"[:250],
         digest,
         parent=tracking["parent"],
-        tags={"grid.overrides": said, "grid.jobs": len(jobs)},
+        tags={"grid.overrides": title, "grid.jobs": len(jobs)},
         config_yaml=OmegaConf.to_yaml(OmegaConf.create([list(job) for job in jobs])),
     )
     log.info("%d jobs; the run above theirs: %s", len(jobs), run.url_hint)
@@ -134,7 +134,7 @@ def _close(
     parent.close("KILLED" if interrupted else "FAILED" if error is not None or failed else "FINISHED")
 
 
-def _own(job: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[str]:
+def _distinct_words(job: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[str]:
     """The words that not all jobs have; all of them when the jobs are equal."""
     return [word for word in job if not all(word in other for other in jobs)] or list(job)
 
@@ -142,6 +142,6 @@ def _own(job: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[str]:
 def _leave_with(verb: str, failed: Sequence[tuple[Sequence[str], str]], jobs: Sequence[Sequence[str]]) -> NoReturn:
     print(f"{verb}: {len(failed)} of {len(jobs)} jobs failed:", file=sys.stderr)
     for job, sentence in failed:
-        print(f"  {' '.join(_own(job, jobs))}: {sentence}", file=sys.stderr)
+        print(f"  {' '.join(_distinct_words(job, jobs))}: {sentence}", file=sys.stderr)
     sys.stderr.flush()
     raise SystemExit(1)

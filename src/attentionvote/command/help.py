@@ -36,8 +36,8 @@ def help_text(settings: type[VerbSettings], conf: Path) -> str:
     lines += ["", "Settings (key=value) and their defaults:"]
     for key, value in leaves(composed):
         lines.append(f"  {key}={json.dumps(value, ensure_ascii=False)}")
-        known = find(settings, key, composed)
-        if known is not None and (text := _meaning(known.setting)):
+        field = find(settings, key, composed)
+        if field is not None and (text := _meaning(field.setting)):
             lines.append(f"      {text}")
     return "\n".join([*lines, "", "A comma-separated list of values with -m runs a grid (Hydra's multirun)."])
 

@@ -35,8 +35,8 @@ def words_of(sections: Collection[str], words: Sequence[str]) -> list[str]:
 
 def words_beside(verb: str, more: Collection[str], words: Sequence[str]) -> list[str]:
     """The words that a verb hands on: neither of settings that its own file makes, nor of the sections ``more``."""
-    own = set(OmegaConf.load(CONF / f"{verb}.yaml")) - {"defaults"} | set(more)
-    return [word for word, section in _sections(words) if section not in own]
+    handled = set(OmegaConf.load(CONF / f"{verb}.yaml")) - {"defaults"} | set(more)
+    return [word for word, section in _sections(words) if section not in handled]
 
 
 def _sections(words: Sequence[str]) -> list[tuple[str, str]]:

@@ -1,1 +1,1 @@
-"""From scene sets and datasets to batches: measured clouds, samples, augmentation, the data module."""
+"""Batches of scene sets and datasets: measured clouds, samples, augmentation, the data module."""

@@ -44,7 +44,7 @@ class TruthOfScenes(Sequence[GroundTruth]):
 
     def __init__(self, dataset: Dataset, names: Sequence[str]) -> None:
         self._dataset, self._names = dataset, names
-        self._known: dict[int, GroundTruth] = {}
+        self._ground_truth: dict[int, GroundTruth] = {}
 
     def __len__(self) -> int:
         return len(self._names)
@@ -56,9 +56,9 @@ class TruthOfScenes(Sequence[GroundTruth]):
     def __getitem__(self, index: int | slice) -> GroundTruth | Sequence[GroundTruth]:
         if isinstance(index, slice):
             return TruthOfScenes(self._dataset, self._names[index])
-        if index not in self._known:
-            self._known[index] = self._dataset.ground_truth(self._names[index])
-        return self._known[index]
+        if index not in self._ground_truth:
+            self._ground_truth[index] = self._dataset.ground_truth(self._names[index])
+        return self._ground_truth[index]
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,10 +57,10 @@ class DatasetSplits:
             ValueError: with one sentence, when the folder is no dataset, or of other or several parts, or cannot be
                 split, or the part's frame is not the dataset's.
         """
-        found = _by_split(open_datasets(folder), folder, part)
-        names = {split: _scored(dataset) for split, dataset in found.items()}
-        splits = {split: DatasetSplit(dataset, names[split], part) for split, dataset in found.items()}
-        origins = {split: f"{dataset.title} {dataset.split}, all" for split, dataset in found.items()}
+        datasets = _by_split(open_datasets(folder), folder, part)
+        names = {split: _scored(dataset) for split, dataset in datasets.items()}
+        splits = {split: DatasetSplit(dataset, names[split], part) for split, dataset in datasets.items()}
+        origins = {split: f"{dataset.title} {dataset.split}, all" for split, dataset in datasets.items()}
         missing = [split for split in SPLITS if split not in splits]
         if missing:
             held = _hold_out(splits["train"], {split: held_out[split] for split in missing})
@@ -110,20 +110,22 @@ class DatasetSplits:
         }
 
 
-def _by_split(found: Sequence[Dataset], folder: Path, part: Part) -> dict[str, Dataset]:
+def _by_split(datasets: Sequence[Dataset], folder: Path, part: Part) -> dict[str, Dataset]:
     """The datasets of the part by ``train``, ``val`` and ``test``; a single one is ``train``, whatever its name."""
-    chosen = [dataset for dataset in found if dataset.parts == (part.name,)] or list(found)
-    chosen = [dataset for dataset in chosen if dataset.split != "real"] or chosen
-    held = ", ".join(f"{one.title} {one.split}" for one in chosen)
-    if len({(one.format, one.parts) for one in chosen}) != 1 or len(chosen[0].parts) != 1:
-        several = len(chosen) == 1
-        got = f"{held} of the parts {', '.join(chosen[0].parts)}" if several else held
+    candidates = [dataset for dataset in datasets if dataset.parts == (part.name,)] or list(datasets)
+    candidates = [dataset for dataset in candidates if dataset.split != "real"] or candidates
+    held = ", ".join(f"{dataset.title} {dataset.split}" for dataset in candidates)
+    if len({(dataset.format, dataset.parts) for dataset in candidates}) != 1 or len(candidates[0].parts) != 1:
+        several = len(candidates) == 1
+        got = f"{held} of the parts {', '.join(candidates[0].parts)}" if several else held
         raise ValueError(
             f"{folder} must hold a dataset of one part, {part.name}, to train on, got {got}: name the folder of one"
         )
-    if len(chosen) == 1:
-        return {"train": chosen[0]}
-    by_split = {split: [one for one in chosen if split_of(Path(one.split)) == split] for split in SPLITS}
+    if len(candidates) == 1:
+        return {"train": candidates[0]}
+    by_split = {
+        split: [dataset for dataset in candidates if split_of(Path(dataset.split)) == split] for split in SPLITS
+    }
     if not by_split["train"] or any(len(datasets) > 1 for datasets in by_split.values()):
         raise ValueError(
             f"{folder} must hold one dataset to train on and at most one for val and for test, got {held}: name the "
@@ -162,5 +164,5 @@ def _hold_out(scenes: DatasetSplit, shares: Mapping[str, float]) -> dict[str, Da
 
 
 def _range_of(cycles: Sequence[str]) -> str:
-    one = len(cycles) == 1
-    return f"1 drop cycle ({cycles[0]})" if one else f"{len(cycles)} drop cycles ({cycles[0]} to {cycles[-1]})"
+    is_single = len(cycles) == 1
+    return f"1 drop cycle ({cycles[0]})" if is_single else f"{len(cycles)} drop cycles ({cycles[0]} to {cycles[-1]})"

@@ -1,4 +1,4 @@
-"""Whether mesh and poses are in one frame: the points of a dataset's parts must lie on the part's surface."""
+"""Check that mesh and poses are in one frame: the points of a dataset's parts must lie on the part's surface."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def check_part_frame(scene: Scene, part: Part, where: str, labelled: bool) -> No
         surface.distances(scene.points[scene.instance_ids == instance], scene.camera_from_part[instance])
         for instance in np.argsort(-scene.visible_fraction)[:_INSTANCES]
     ]
-    found = np.concatenate(distances)
-    apart, limit = float(np.quantile(found, 0.9)) if len(found) else 0.0, _TOLERANCE * part.diameter
+    point_distances = np.concatenate(distances)
+    apart, limit = float(np.quantile(point_distances, 0.9)) if len(point_distances) else 0.0, _TOLERANCE * part.diameter
     if apart > limit:
         raise ValueError(
             f"{part.name} must have the frame of the poses in {where} (points within {1000 * limit:.1f} mm of its "

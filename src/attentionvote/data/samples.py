@@ -21,7 +21,7 @@ class Batch(NamedTuple):
     Attributes:
         points, normals: ``(batch, N, 3)`` camera frame, metres.
         instance: ``(batch, N)`` instance of each point, -1 for none.
-        found: neighbourhoods of the points.
+        neighborhoods: of the points.
         center: ``(batch, I, 3)`` origins of the instances, camera frame.
         rotation: ``(batch, I, 3, 3)`` ``camera_from_part``.
         visible: ``(batch, I)`` visible fraction, 0 where padded.
@@ -31,7 +31,7 @@ class Batch(NamedTuple):
     points: Tensor
     normals: Tensor
     instance: Tensor
-    found: Neighborhoods
+    neighborhoods: Neighborhoods
     center: Tensor
     rotation: Tensor
     visible: Tensor
@@ -43,16 +43,22 @@ class Batch(NamedTuple):
         def moved(value: Tensor) -> Tensor:
             return value.to(device, dtype if value.is_floating_point() else None)
 
-        found = self.found.to(device, dtype)
-        return Batch(**{name: moved(getattr(self, name)) for name in self._fields if name != "found"}, found=found)
+        neighborhoods = self.neighborhoods.to(device, dtype)
+        return Batch(
+            **{name: moved(getattr(self, name)) for name in self._fields if name != "neighborhoods"},
+            neighborhoods=neighborhoods,
+        )
 
     def first(self, count: int) -> Batch:
         """Only the first ``count`` samples."""
-        found = Neighborhoods(
-            self.found.order[:count],
-            *(tuple(level[:count] for level in levels) for levels in self.found[1:]),
+        neighborhoods = Neighborhoods(
+            self.neighborhoods.order[:count],
+            *(tuple(level[:count] for level in levels) for levels in self.neighborhoods[1:]),
         )
-        return Batch(**{name: getattr(self, name)[:count] for name in self._fields if name != "found"}, found=found)
+        return Batch(
+            **{name: getattr(self, name)[:count] for name in self._fields if name != "neighborhoods"},
+            neighborhoods=neighborhoods,
+        )
 
 
 def draw_sample(
@@ -65,16 +71,16 @@ def draw_sample(
     """
     if scene.normals is None:
         raise ValueError("a scene must have normals before it is sampled, got none: estimate_normals first")
-    chosen = sample_indices(len(scene.points), count, rng)
+    rows = sample_indices(len(scene.points), count, rng)
     # Rows by take: a fifth of the time of an index in brackets.
-    points, normals = scene.points.take(chosen, axis=0), scene.normals.take(chosen, axis=0)
+    points, normals = scene.points.take(rows, axis=0), scene.normals.take(rows, axis=0)
     poses = scene.camera_from_part
     if augmentation is not None:
         points, normals, poses = augmentation.apply(points, normals, poses, rng)
     return Batch(
         torch.from_numpy(np.ascontiguousarray(points)),
         torch.from_numpy(np.ascontiguousarray(normals)),
-        torch.from_numpy(scene.instance_ids[chosen].astype(np.int64)),
+        torch.from_numpy(scene.instance_ids[rows].astype(np.int64)),
         find_neighborhoods(points, layout),
         torch.from_numpy(poses[:, :3, 3].astype(np.float32)),
         torch.from_numpy(poses[:, :3, :3].astype(np.float32)),
@@ -98,7 +104,7 @@ def collate(samples: Sequence[Batch]) -> Batch:
         torch.stack([s.points for s in samples]),
         torch.stack([s.normals for s in samples]),
         torch.stack([s.instance for s in samples]),
-        Neighborhoods.stack([s.found for s in samples]),
+        Neighborhoods.stack([s.neighborhoods for s in samples]),
         padded("center", torch.zeros(3)),
         padded("rotation", torch.eye(3)),
         padded("visible", torch.zeros(())),

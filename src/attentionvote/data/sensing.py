@@ -64,8 +64,8 @@ def with_normals(scene: Scene, rng: np.random.Generator, settings: CloudSettings
         return Scene(
             empty, np.zeros(0, np.int32), scene.camera_from_part, scene.visible_fraction, scene.part_ids, empty
         )
-    kept = sample_indices(len(scene.points), min(settings.pool, len(scene.points)), rng)
-    points = scene.points.take(kept, axis=0)
+    rows = sample_indices(len(scene.points), min(settings.pool, len(scene.points)), rng)
+    points = scene.points.take(rows, axis=0)
     normals = estimate_normals(scene.points, points, settings.neighbors)
-    ids = scene.instance_ids[kept]
+    ids = scene.instance_ids[rows]
     return Scene(points, ids, scene.camera_from_part, scene.visible_fraction, scene.part_ids, normals)

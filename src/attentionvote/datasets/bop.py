@@ -76,8 +76,8 @@ class BopDataset(Dataset):
 
     def camera(self, name: str) -> PinholeCamera:
         """Intrinsics; the size is the picture's own."""
-        path, said = self._camera_entry(name)
-        matrix = said.get("cam_K")
+        path, entry = self._camera_entry(name)
+        matrix = entry.get("cam_K")
         try:
             k = np.asarray(matrix, dtype=np.float64).reshape(3, 3)
         except (TypeError, ValueError) as error:
@@ -96,9 +96,9 @@ class BopDataset(Dataset):
             ids = [self.object_ids.index(int(entry["obj_id"])) for entry in entries]
             rotations, translations = ([entry[key] for entry in entries] for key in ("cam_R_m2c", "cam_t_m2c"))
         except (KeyError, TypeError, ValueError) as error:
-            known = ", ".join(map(str, self.object_ids))
+            listed = ", ".join(map(str, self.object_ids))
             raise ValueError(
-                f"{path}: every entry of image {name} must have cam_R_m2c, cam_t_m2c and an obj_id among {known}"
+                f"{path}: every entry of image {name} must have cam_R_m2c, cam_t_m2c and an obj_id among {listed}"
             ) from error
         poses = poses_in_millimetres(f"{path}: image {name}", rotations, translations)
         return GroundTruth(poses, self._visible(name, len(poses)), np.array(ids, dtype=np.int32), np.arange(len(poses)))
@@ -116,9 +116,9 @@ class BopDataset(Dataset):
 
     def frame(self, name: str, labels: bool = True) -> Frame:
         """The picture of a scene; nothing in the format tells the bin from the parts but the masks."""
-        path, said = self._camera_entry(name)
+        path, entry = self._camera_entry(name)
         camera = self.camera(name)
-        scale = number(path, said, "depth_scale") / 1000
+        scale = number(path, entry, "depth_scale") / 1000
         depth = DepthCoding(0.0, scale, MISSING).decode(read_depth_counts(self._depth_file(name)))
         measured = depth[np.isfinite(depth)]
         middle = float(np.median(measured)) if len(measured) else 1.0
@@ -167,7 +167,7 @@ class BopDataset(Dataset):
         return self._loaded[1]
 
     def _camera_entry(self, name: str) -> tuple[Path, dict[str, Any]]:
-        scene, _, image = self._known(name).partition("/")
+        scene, _, image = self._checked(name).partition("/")
         path = self._folders[scene] / f"scene_camera{self._suffix}.json"
         entry = self._scene_files(scene).camera.get(str(int(image)))
         if not isinstance(entry, dict):
@@ -176,12 +176,12 @@ class BopDataset(Dataset):
 
     def _rows(self, name: str) -> list[Any]:
         """Entries of a picture, none where there is no ground truth."""
-        scene, _, image = self._known(name).partition("/")
+        scene, _, image = self._checked(name).partition("/")
         entries = (self._scene_files(scene).gt or {}).get(str(int(image)), [])
         return entries if isinstance(entries, list) else []
 
     def _entries(self, name: str) -> tuple[list[Any], Path]:
-        scene, _, image = self._known(name).partition("/")
+        scene, _, image = self._checked(name).partition("/")
         path = self._folders[scene] / f"scene_gt{self._suffix}.json"
         gt = self._scene_files(scene).gt
         if gt is None or not isinstance(gt.get(str(int(image))), list):
@@ -212,7 +212,7 @@ class BopDataset(Dataset):
         return mask > 0
 
     def _depth_file(self, name: str) -> Path:
-        scene, _, image = self._known(name).partition("/")
+        scene, _, image = self._checked(name).partition("/")
         folder = self._folders[scene] / f"depth{self._suffix}"
         tif = folder / f"{image}.tif"
         return tif if tif.is_file() else folder / f"{image}.png"

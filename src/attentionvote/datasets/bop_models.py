@@ -136,12 +136,12 @@ def _closed(where: str, turns: NDArray[np.float64]) -> NDArray[np.float64]:
     pending = [_nearest_rotation(where, turn) for turn in turns]
     while pending:
         turn = pending.pop()
-        if min(float(np.abs(turn - known).max()) for known in group) < 1e-3:
+        if min(float(np.abs(turn - member).max()) for member in group) < 1e-3:
             continue
         group.append(turn)
         if len(group) > MOST_ROTATIONS:
             raise ValueError(f"{where} must have a symmetry group of at most {MOST_ROTATIONS} rotations, got more")
-        pending += [product for known in group for product in (known @ turn, turn @ known)]
+        pending += [product for member in group for product in (member @ turn, turn @ member)]
     return np.array(group)
 
 

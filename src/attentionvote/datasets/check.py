@@ -1,4 +1,4 @@
-"""What is wrong with a dataset on disk: files, counts, units, rotations, labels, frames; one sentence a finding."""
+"""Findings about a dataset on disk: files, counts, units, rotations, labels, frames; one sentence each."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def check_dataset(
     findings = _of_counts(dataset, where)
     lacking = _of_files(dataset, where, findings)
     last = len(dataset.names) - 1
-    chosen = sorted({round(share * last) for share in 1 - np.linspace(0, 1, most_scenes)}) if last >= 0 else []
+    opened_indices = sorted({round(share * last) for share in 1 - np.linspace(0, 1, most_scenes)}) if last >= 0 else []
     problems: dict[str, list[str]] = defaultdict(list)
     placement, opened, instances = _try_diameters(dataset, findings), 0, 0
-    for done, index in enumerate(chosen):
+    for done, index in enumerate(opened_indices):
         name = dataset.names[index]
         try:
             if not lacking.get(name):
@@ -84,7 +84,7 @@ def check_dataset(
             sentence = " ".join(str(error).split())
             problems[_kind(sentence)].append(sentence)
         if progress is not None:
-            progress(done + 1, len(chosen))
+            progress(done + 1, len(opened_indices))
     findings += [Finding("error", _first_of(sentences)) for sentences in problems.values()]
     verdict = placement.judge()
     if verdict.is_wrong:
@@ -100,15 +100,15 @@ def check_dataset(
     return Report(dataset, _scored(dataset), _expected(dataset), opened, instances, verdict, tuple(findings))
 
 
-def _of_files(dataset: Dataset, where: str, found: list[Finding]) -> dict[str, set[str]]:
+def _of_files(dataset: Dataset, where: str, findings: list[Finding]) -> dict[str, set[str]]:
     """The kinds of files that a scene lacks, by its name."""
     if not dataset.names:
-        found.append(Finding("error", f"{where}: there must be scenes, got none in {dataset.directory}"))
+        findings.append(Finding("error", f"{where}: there must be scenes, got none in {dataset.directory}"))
         return {}
     try:
         missing = dataset.missing_files()
     except (ValueError, OSError) as error:
-        found.append(Finding("error", " ".join(str(error).split())))
+        findings.append(Finding("error", " ".join(str(error).split())))
         return {}
     for kind, names in missing.items():
         if not names:
@@ -119,9 +119,9 @@ def _of_files(dataset: Dataset, where: str, found: list[Finding]) -> dict[str, s
             "warning" if dataset.format == "bop" and kind == "gt" and nowhere else "error"
         )
         many = "every scene lacks" if nowhere else f"{len(names)} of {len(dataset.names)} scenes lack"
-        found.append(Finding(severity, f"{where}: {many} its {KIND_OF_FILE[kind]}, the first is {names[0]}"))
+        findings.append(Finding(severity, f"{where}: {many} its {KIND_OF_FILE[kind]}, the first is {names[0]}"))
     if not dataset.has_labels:
-        found.append(Finding("warning", f"{where}: there are no images of labels, so points have no instance"))
+        findings.append(Finding("warning", f"{where}: there are no images of labels, so points have no instance"))
     lacking: dict[str, set[str]] = defaultdict(set)
     for kind, names in missing.items():
         for name in names:
@@ -130,11 +130,11 @@ def _of_files(dataset: Dataset, where: str, found: list[Finding]) -> dict[str, s
 
 
 def _of_counts(dataset: Dataset, where: str) -> list[Finding]:
-    found = []
+    findings = []
     scored, expected = _scored(dataset), _expected(dataset)
     if expected is not None and scored is not None and scored != expected:
         what = "the Sileane set" if dataset.format == "sileane" else "the paper's Table 1"
-        found.append(
+        findings.append(
             Finding(
                 "warning",
                 f"{where}: {what} has {expected} scenes with at least {LEAST_DROPS} drops, here are {scored}",
@@ -142,22 +142,22 @@ def _of_counts(dataset: Dataset, where: str) -> list[Finding]:
         )
     if isinstance(dataset, IpaDataset) and not dataset.is_generated:
         if dataset.benchmark and dataset.split not in ("train", "test", "real"):
-            found.append(
+            findings.append(
                 Finding(
                     "warning",
                     f"{where}: the folder's name says neither train nor test, so the counts are not compared",
                 )
             )
         if dataset.parts == ("ring_screw",) and dataset.split == "test":
-            found.append(
+            findings.append(
                 Finding(
                     "warning",
                     f"{where}: depth and labels of the synthetic test set of the ring screw are known not to fit "
                     "(paper section 4.1): use the real one",
                 )
             )
-        found += _of_cycles(dataset, where)
-    return found
+        findings += _of_cycles(dataset, where)
+    return findings
 
 
 def _of_cycles(dataset: IpaDataset, where: str) -> list[Finding]:
@@ -175,23 +175,23 @@ def _of_cycles(dataset: IpaDataset, where: str) -> list[Finding]:
 
 
 def _of_labels(frame: Frame, name: str) -> list[tuple[str, str]]:
-    found = []
+    findings = []
     if frame.unknown_pixels:
-        found.append(
+        findings.append(
             ("unknown", f"every label must be an instance's, {frame.unknown_pixels} pixels of {name} have another")
         )
     pixels = np.bincount(frame.instance[frame.instance >= 0], minlength=len(frame.ground_truth.part_ids))
     empty = np.flatnonzero((pixels == 0) & (frame.ground_truth.visible_fraction >= CLEARLY_VISIBLE))
     if len(empty):
         row = int(empty[0])
-        found.append(
+        findings.append(
             (
                 "empty",
                 f"every visible part must have pixels, part {row} of {name} is visible to "
                 f"{frame.ground_truth.visible_fraction[row]:.0%} and has none",
             )
         )
-    return found
+    return findings
 
 
 def _scored(dataset: Dataset) -> int | None:
@@ -202,12 +202,12 @@ def _scored(dataset: Dataset) -> int | None:
 
 
 def _expected(dataset: Dataset) -> int | None:
-    known = dataset.benchmark
-    if known is None or dataset.format == "bop" or dataset.is_generated:
+    benchmark = dataset.benchmark
+    if benchmark is None or dataset.format == "bop" or dataset.is_generated:
         return None
     if dataset.format == "sileane":
-        return known.sileane and known.sileane[0] * (known.sileane[1] - LEAST_DROPS)
-    return known.expected_ipa_scenes(dataset.split)
+        return benchmark.sileane and benchmark.sileane[0] * (benchmark.sileane[1] - LEAST_DROPS)
+    return benchmark.expected_ipa_scenes(dataset.split)
 
 
 def _try_diameters(dataset: Dataset, findings: list[Finding]) -> PlacementCheck:

@@ -1,4 +1,4 @@
-"""What every reader gives: names of scenes in order, and for each of them camera, ground truth and ``Scene``."""
+"""The interface of every reader: names of scenes in order, and for each of them camera, ground truth and ``Scene``."""
 
 from __future__ import annotations
 
@@ -155,12 +155,12 @@ class Dataset(ABC):
 
     def cycle_of(self, name: str) -> str:
         """The drop cycle (BOP: scene) that a scene belongs to: scenes of one are nearly the same picture."""
-        return self._known(name).rpartition("/")[0]
+        return self._checked(name).rpartition("/")[0]
 
     @property
     def diameters(self) -> tuple[float | None, ...]:
         """D of every part in metres, where the files or the paper's Table 1 say it."""
-        return tuple(known.diameter if known else None for known in map(benchmark_object, self.parts))
+        return tuple(benchmark.diameter if benchmark else None for benchmark in map(benchmark_object, self.parts))
 
     @property
     def camera_from_file(self) -> NDArray[np.float64]:
@@ -227,7 +227,7 @@ class Dataset(ABC):
             part_ids=truth.part_ids,
         )
 
-    def _known(self, name: str) -> str:
+    def _checked(self, name: str) -> str:
         if name not in self._name_set:
             raise ValueError(f"{self.directory}: there is no scene {name!r}, the names go from {self._range}")
         return name

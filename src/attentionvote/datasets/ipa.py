@@ -95,7 +95,7 @@ def read_ground_truth(path: Path) -> GroundTruth:
     places = [header.index(name) for name in wanted]
     try:
         rows = list(csv.reader(lines[1:]))
-        table = np.array([[float(row[place]) for place in places] for row in rows]).reshape(-1, len(places))
+        table = np.array([[float(row[column]) for column in places] for row in rows]).reshape(-1, len(places))
     except (ValueError, IndexError, csv.Error) as error:
         raise ValueError(f"{path}: every row must have {len(header)} values, numbers in the named columns") from error
     ids = table[:, 0]
@@ -137,8 +137,8 @@ class IpaDataset(Dataset):
         self.directory = self._folders[0]
         self.real = real
         self.title = re.sub(r"_part_\d+$", "", self.directory.resolve().name)
-        known = benchmark_object(self.title)
-        self.parts = (known.name if known else self.title,)
+        benchmark = benchmark_object(self.title)
+        self.parts = (benchmark.name if benchmark else self.title,)
         self.split = "real" if real else split
         self._files: dict[str, dict[str, Path]] = {"depth": {}, "gt": {}, "labels": {}}
         self._part_of_cycle: dict[str, Path] = {}
@@ -150,7 +150,7 @@ class IpaDataset(Dataset):
 
     def drop_count(self, name: str) -> int:
         """The number in the file's name."""
-        return int(self._known(name).partition("/")[2])
+        return int(self._checked(name).partition("/")[2])
 
     def camera(self, name: str) -> PinholeCamera:
         """Intrinsics, from the ``parameter.json`` of the scene's part."""
@@ -217,16 +217,16 @@ class IpaDataset(Dataset):
         depth, gt, labels = "p_depth", "gt", "p_segmentation"
         if self.real:
             depth = "p_depth_real_world"
-            own_labels = not (folder / "p_depth").is_dir()
-            gt = "gt" if own_labels and not (folder / "gt_real_world").is_dir() else "gt_real_world"
+            only_real = not (folder / "p_depth").is_dir()
+            gt = "gt" if only_real and not (folder / "gt_real_world").is_dir() else "gt_real_world"
             real_labels = f"{labels}_real_world"
-            labels = labels if own_labels and not (folder / real_labels).is_dir() else real_labels
-        for kind, place, suffix in (
+            labels = labels if only_real and not (folder / real_labels).is_dir() else real_labels
+        for kind, subfolder, suffix in (
             ("depth", depth, DEPTH_SUFFIX),
             ("gt", gt, ".csv"),
             ("labels", labels, LABEL_SUFFIX),
         ):
-            for path in (folder / place).glob(f"cycle_*/*{suffix}"):
+            for path in (folder / subfolder).glob(f"cycle_*/*{suffix}"):
                 count = path.name.removesuffix(suffix)
                 if not count.isdigit():
                     continue
@@ -239,13 +239,13 @@ class IpaDataset(Dataset):
                 self._files[kind][f"{cycle}/{int(count):03d}"] = path
 
     def _file(self, name: str, kind: str) -> Path:
-        path = self._files[kind].get(self._known(name))
+        path = self._files[kind].get(self._checked(name))
         if path is None:
             raise ValueError(f"{self.directory}: scene {name} has no file of its {kind}")
         return path
 
     def _parameters(self, name: str) -> IpaParameters:
-        folder = self._part_of_cycle[self._known(name).partition("/")[0]]
+        folder = self._part_of_cycle[self._checked(name).partition("/")[0]]
         if folder not in self._by_folder:
             self._by_folder[folder] = read_parameters(folder / "parameter.json")
         return self._by_folder[folder]

@@ -91,8 +91,8 @@ class PlacementCheck:
         """D of every instance's part, known or the largest extent seen of any of it."""
         extents = np.array([np.linalg.norm(np.ptp(points, axis=0)) for points in self._points])
         parts = np.array(self._parts)
-        known = [self._diameters[part] if part < len(self._diameters) else None for part in range(parts.max() + 1)]
-        return np.array([known[part] or extents[parts == part].max() for part in self._parts])
+        diameters = [self._diameters[part] if part < len(self._diameters) else None for part in range(parts.max() + 1)]
+        return np.array([diameters[part] or extents[parts == part].max() for part in self._parts])
 
     def _off(self, origins: NDArray[np.float64], limits: NDArray[np.float64]) -> int:
         distances = [

@@ -1,4 +1,4 @@
-"""What a pose of any format must be: finite, a rotation, in the unit the format says."""
+"""Rules for a pose of any format: finite, a rotation, in the unit that the format states."""
 
 from __future__ import annotations
 

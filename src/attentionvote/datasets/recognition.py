@@ -1,4 +1,4 @@
-"""Which format a folder is, by its files."""
+"""Recognition of a folder's format by its files."""
 
 from __future__ import annotations
 
@@ -33,10 +33,12 @@ def open_datasets(directory: Path) -> list[Dataset]:
     """
     if not directory.is_dir():
         raise UnknownLayout(f"{directory}: the folder of a dataset must exist, got {_what(directory)}")
-    found: dict[tuple[Opener, Path, str], list[Path]] = {}
+    folders_by_kind: dict[tuple[Opener, Path, str], list[Path]] = {}
     for folder, opener, group in _folders(directory, LEVELS):
-        found.setdefault((opener, folder.parent, group), []).append(folder)
-    datasets = [dataset for (opener, _, group), folders in found.items() for dataset in opener(folders, group)]
+        folders_by_kind.setdefault((opener, folder.parent, group), []).append(folder)
+    datasets = [
+        dataset for (opener, _, group), folders in folders_by_kind.items() for dataset in opener(folders, group)
+    ]
     if not datasets:
         looks = "; ".join(f"{name}: {look}" for name, look in LOOKS.items())
         raise UnknownLayout(f"{directory} must hold a dataset of a known layout, got none of them ({looks})")
@@ -79,7 +81,7 @@ def _is_ipa(folder: Path) -> bool:
 
 def _is_sileane(folder: Path) -> bool:
     places = [folder / name for name in ("gt", *DEPTH_FOLDERS)]
-    return (folder / CAMERA_FILE).is_file() and any(place.is_dir() for place in places)
+    return (folder / CAMERA_FILE).is_file() and any(path.is_dir() for path in places)
 
 
 def _open_bop(folders: list[Path], sensor: str) -> list[Dataset]:
@@ -93,8 +95,8 @@ def _open_sileane(folders: list[Path], _: str) -> list[Dataset]:
 def _open_ipa(folders: list[Path], _: str) -> list[Dataset]:
     split = split_of(folders[0].resolve().parent)
     datasets: list[Dataset] = []
-    for place, real in (("p_depth", False), ("p_depth_real_world", True)):
-        having = [folder for folder in folders if (folder / place).is_dir()]
+    for depth_folder, real in (("p_depth", False), ("p_depth_real_world", True)):
+        having = [folder for folder in folders if (folder / depth_folder).is_dir()]
         if having or (not real and not any((folder / "p_depth_real_world").is_dir() for folder in folders)):
             datasets.append(IpaDataset(having or folders, real, split))
     return datasets

@@ -55,12 +55,14 @@ def read_camera(path: Path) -> SileaneCamera:
         ValueError: with one sentence, when a key is missing or impossible.
     """
     lines = [line.partition("#")[0].split() for line in read_text(path).splitlines()]
-    said = {words[0]: words[1:] for words in lines if words}
-    singles = {key: values[0] for key, values in said.items() if len(values) == 1}
+    values_by_key = {words[0]: words[1:] for words in lines if words}
+    singles = {key: values[0] for key, values in values_by_key.items() if len(values) == 1}
     keys = ("width", "height", "fu", "fv", "cu", "cv", "clip_start", "clip_end")
     width, height, fu, fv, cu, cv, clip_start, clip_end = (number(path, singles, key) for key in keys)
     check_depth_range(path, clip_start, clip_end)
-    location, rotation = (_numbers(path, said, key, count) for key, count in (("location", 3), ("rotation", 4)))
+    location, rotation = (
+        _numbers(path, values_by_key, key, count) for key, count in (("location", 3), ("rotation", 4))
+    )
     if not 0.99 < np.linalg.norm(rotation) < 1.01:
         raise ValueError(f"{path}: rotation must be a unit quaternion w x y z, got {rotation.tolist()}")
     try:
@@ -128,8 +130,8 @@ class SileaneDataset(Dataset):
         self.names = tuple(sorted(set().union(*self._files.values()), key=_order))
         objects = sorted({_order(name)[0] for name in self.names if _order(name)[1] >= 0})
         self.title = objects[0] if objects else directory.resolve().name
-        known = benchmark_object(self.title) or benchmark_object(directory.resolve().name)
-        self.parts = (known.name if known else self.title,)
+        benchmark = benchmark_object(self.title) or benchmark_object(directory.resolve().name)
+        self.parts = (benchmark.name if benchmark else self.title,)
         self.has_labels = bool(self._files["labels"])
 
     @property
@@ -147,12 +149,12 @@ class SileaneDataset(Dataset):
 
     def drop_count(self, name: str) -> int:
         """The last number of the name; of another name the entries of its ground truth."""
-        count = _order(self._known(name))[2]
+        count = _order(self._checked(name))[2]
         return count if count >= 0 else len(self.ground_truth(name).camera_from_part)
 
     def camera(self, name: str) -> PinholeCamera:
         """Intrinsics; the same for every scene."""
-        self._known(name)
+        self._checked(name)
         return self._camera.camera
 
     def ground_truth(self, name: str) -> GroundTruth:
@@ -171,12 +173,12 @@ class SileaneDataset(Dataset):
 
     def picture_rule(self, name: str) -> str:
         """What ``camera_params.txt`` says."""
-        self._known(name)
+        self._checked(name)
         return f"{self._camera.camera} {self._camera.coding} {self._camera.world_from_camera.tolist()}"
 
     def cycle_of(self, name: str) -> str:
         """Object and cycle, ``bunny_3``; of another name the whole."""
-        part, cycle, _ = _order(self._known(name))
+        part, cycle, _ = _order(self._checked(name))
         return f"{part}_{cycle}" if cycle >= 0 else name
 
     def frame(self, name: str, labels: bool = True) -> Frame:
@@ -215,7 +217,7 @@ class SileaneDataset(Dataset):
         return read_camera(self.directory / CAMERA_FILE)
 
     def _file(self, name: str, kind: str) -> Path:
-        path = self._files[kind].get(self._known(name))
+        path = self._files[kind].get(self._checked(name))
         if path is None:
             raise ValueError(f"{self.directory}: scene {name} has no file of its {kind}")
         return path
@@ -235,8 +237,8 @@ def _order(name: str) -> tuple[str, int, int]:
     return name, -1, -1
 
 
-def _numbers(path: Path, said: dict[str, list[str]], key: str, count: int) -> NDArray[np.float64]:
-    values = said.get(key, [])
+def _numbers(path: Path, values_by_key: dict[str, list[str]], key: str, count: int) -> NDArray[np.float64]:
+    values = values_by_key.get(key, [])
     if len(values) != count:
         raise ValueError(f"{path}: {key} must have {count} numbers, got {len(values)}")
     return np.array([number(path, {key: value}, key) for value in values])

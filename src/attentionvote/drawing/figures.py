@@ -38,9 +38,9 @@ def _polish(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 def smoothed(values: ArrayLike, window: int) -> NDArray[np.float64]:
     """Running mean over the last ``window`` finite values, same length."""
     values = np.asarray(values, dtype=np.float64)
-    known = np.isfinite(values)
-    total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
-    count = np.concatenate([[0], np.cumsum(known)])
+    finite = np.isfinite(values)
+    total = np.concatenate([[0.0], np.cumsum(np.where(finite, values, 0.0))])
+    count = np.concatenate([[0], np.cumsum(finite)])
     end = np.arange(1, len(values) + 1)
     start = np.maximum(0, end - window)
     number = count[end] - count[start]

@@ -202,14 +202,16 @@ def scene_picture(
     cloud, voted, peaked, centers = (
         np.asarray(a, dtype=np.float64).reshape(-1, 3) for a in (points, votes, peaks, gt_centers)
     )
-    found, truth = (np.asarray(a, dtype=np.float64).reshape(-1, 4, 4) for a in (predicted_poses, gt_poses))
+    predicted_matrices, truth = (np.asarray(a, dtype=np.float64).reshape(-1, 4, 4) for a in (predicted_poses, gt_poses))
     hot, is_correct = np.asarray(heat, dtype=np.float64).ravel(), np.asarray(correct, dtype=bool).ravel()
     if len(hot) != len(voted):
         raise ValueError(f"heat must have one value for each of the {len(voted)} votes, got {len(hot)}")
-    if len(is_correct) != len(found):
-        raise ValueError(f"correct must have one value for each of the {len(found)} poses, got {len(is_correct)}")
+    if len(is_correct) != len(predicted_matrices):
+        raise ValueError(
+            f"correct must have one value for each of the {len(predicted_matrices)} poses, got {len(is_correct)}"
+        )
     meshes = [Wireframe(*mesh) for mesh in zip(vertices, faces, strict=True)]
-    predicted, true = _with_meshes(meshes, found, predicted_parts), _with_meshes(meshes, truth, gt_parts)
+    predicted, true = _with_meshes(meshes, predicted_matrices, predicted_parts), _with_meshes(meshes, truth, gt_parts)
     shown = cloud if len(cloud) else voted
     extent = np.ptp(shown, axis=0) if len(shown) else np.ones(3)
     ratio = np.clip(extent / max(float(extent[0]), 1e-6), 0.15, 1.6)

@@ -1,4 +1,4 @@
-"""How good a detector is: pose distances, matching, average precision, ADD, recall by visibility.
+"""Quality of a detector: pose distances, matching, average precision, ADD, recall by visibility.
 
 Numpy and scipy only. Definitions follow the toolbox of Bregier et al. (2017).
 """

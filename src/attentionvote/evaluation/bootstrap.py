@@ -1,4 +1,4 @@
-"""How sure a figure is: the test set drawn anew from its own scenes, many times (Efron's bootstrap).
+"""Uncertainty of a figure: the test set drawn anew from its own scenes, many times (Efron's bootstrap).
 
 Scenes are the unit, not poses: the parts of one pile are found or missed together. Two models measured on the same
 scenes are compared draw by draw with the same weights (paired), which removes what both find hard.
@@ -62,7 +62,9 @@ def resampled_figures(
     if weights.ndim != 2 or weights.shape[1] != len(scenes):
         raise ValueError(f"weights must be (draws, {len(scenes)}), one column a scene, got {weights.shape}")
     if len(part.parts) > 1:
-        return by_part(scenes, part, lambda own, one: resampled_figures(own, one, working_point, weights))
+        return by_part(
+            scenes, part, lambda part_scenes, member: resampled_figures(part_scenes, member, working_point, weights)
+        )
     (part,) = part.parts
     metric = PoseMetric.of(part)
     tables = distance_tables(scenes, metric)
@@ -77,11 +79,13 @@ def resampled_figures(
             _areas(weights[start : start + _CHUNK] / len(scenes), precision, recall)
             for start in range(0, len(weights), _CHUNK)
         ])  # fmt: skip
-    kept = [scene.above(working_point) for scene in scenes]
-    found = score_tables(kept, distance_tables(kept, metric), DETAIL_THRESHOLD * part.diameter).per_scene
-    right = weights @ np.array([curve.true_positives[-1] for curve in found])
-    wrong = weights @ np.array([curve.false_positives[-1] for curve in found])
-    required = weights @ np.array([curve.required for curve in found])
+    confident = [scene.above(working_point) for scene in scenes]
+    confident_curves = score_tables(
+        confident, distance_tables(confident, metric), DETAIL_THRESHOLD * part.diameter
+    ).per_scene
+    right = weights @ np.array([curve.true_positives[-1] for curve in confident_curves])
+    wrong = weights @ np.array([curve.false_positives[-1] for curve in confident_curves])
+    required = weights @ np.array([curve.required for curve in confident_curves])
     # As in a score curve: nothing given is no mistake, and of nothing to be found nothing is missed.
     figures["precision_10"] = np.where(right + wrong > 0, right / np.maximum(right + wrong, 1), 1.0)
     figures["recall_10"] = np.where(required > 0, right / np.maximum(required, 1), 1.0)

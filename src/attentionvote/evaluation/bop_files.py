@@ -63,9 +63,9 @@ def parse_name(path: str | Path) -> BopName:
         dataset, split = parts[1].split("-", 1)
         return BopName(parts[0], dataset, split)
     hint = ""
-    place = next((i for i, part in enumerate(parts[1:], 1) if re.fullmatch(r"[^-]+(-[^-]+)+", part)), None)
-    if path.suffix == ".csv" and place is not None and place > 1:  # an underscore in the method
-        hint = f", did you mean '{'_'.join(['-'.join(parts[:place]), *parts[place:]])}.csv'?"
+    index = next((i for i, part in enumerate(parts[1:], 1) if re.fullmatch(r"[^-]+(-[^-]+)+", part)), None)
+    if path.suffix == ".csv" and index is not None and index > 1:  # an underscore in the method
+        hint = f", did you mean '{'_'.join(['-'.join(parts[:index]), *parts[index:]])}.csv'?"
     raise ValueError(
         f"{path}: the file must be named {NAME_RULE} without an underscore in METHOD, got {path.name!r}{hint}"
     )
@@ -223,8 +223,8 @@ def _object(path: str | Path) -> dict[str, Any]:
 
 def _array(where: str, entry: Any, key: str, count: int) -> Array:
     if not isinstance(entry, dict) or key not in entry:
-        known = ", ".join(entry) if isinstance(entry, dict) and entry else "nothing"
-        raise ValueError(f"{where} must have {key}, got only {known}")
+        present = ", ".join(entry) if isinstance(entry, dict) and entry else "nothing"
+        raise ValueError(f"{where} must have {key}, got only {present}")
     try:
         values = np.asarray(entry[key], dtype=np.float64).reshape(-1)
     except (TypeError, ValueError):

@@ -76,8 +76,8 @@ def bop_scores(
         ValueError: with one sentence, when results lie in no image, an object has no model, no pose is visible
             enough to count, or the results are in another unit.
     """
-    known = set(images)
-    lost = [i for i, image in enumerate(map(tuple, estimates.images.tolist())) if image not in known]
+    image_ids = set(images)
+    lost = [i for i, image in enumerate(map(tuple, estimates.images.tolist())) if image not in image_ids]
     if lost:
         scene, image = estimates.images[lost[0]]
         raise ValueError(
@@ -89,11 +89,11 @@ def bop_scores(
         raise ValueError(f"every object of the ground truth must have a model, got none of object {missing[0]}")
     if not (truth.values >= LEAST_VISIBLE).any():
         raise ValueError(f"at least one true pose must be visible by {LEAST_VISIBLE}, got none of {len(truth.values)}")
-    found_mm, true_mm = (1000 * p.poses[:, :3, 3] for p in (estimates, truth))
-    if problem := unit_problem(found_mm, true_mm, "millimetres", "metres"):
+    estimated_mm, true_mm = (1000 * p.poses[:, :3, 3] for p in (estimates, truth))
+    if problem := unit_problem(estimated_mm, true_mm, "millimetres", "metres"):
         raise ValueError(problem)
-    kept = _within_limit(estimates, result_limit)
-    errors, elsewhere = _errors(kept, truth, models, vertices)
+    limited = _within_limit(estimates, result_limit)
+    errors, elsewhere = _errors(limited, truth, models, vertices)
     per_object = {}
     for number, listed in errors.items():
         targets = sum(int(image.counts.sum()) for image in listed)
@@ -102,21 +102,21 @@ def bop_scores(
         diameter = models[number].diameter
         ap = [coco_precision([e._replace(errors=e.errors / diameter) for e in listed], t) or 0.0 for t in SHARES]
         ap_mm = [coco_precision([e._replace(errors=1000 * e.errors) for e in listed], t) or 0.0 for t in LENGTHS_MM]
-        given = sum(len(image.scores) for image in listed)
-        per_object[number] = ObjectScores(float(np.mean(ap)), float(np.mean(ap_mm)), ap, ap_mm, targets, given)
+        result_count = sum(len(image.scores) for image in listed)
+        per_object[number] = ObjectScores(float(np.mean(ap)), float(np.mean(ap_mm)), ap, ap_mm, targets, result_count)
     return BopScores(
         float(np.mean([o.map for o in per_object.values()])),
         float(np.mean([o.map_mm for o in per_object.values()])),
         per_object,
-        len(known),
-        len(estimates.values) - len(kept.values),
+        len(image_ids),
+        len(estimates.values) - len(limited.values),
         elsewhere,
     )
 
 
-def selected(poses: BopPoses, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> BopPoses:
+def selected(poses: BopPoses, rows: NDArray[np.int64] | NDArray[np.bool_]) -> BopPoses:
     """The poses of the given indices ``(M,)``, or of a mask ``(N,)``."""
-    return BopPoses(poses.images[chosen], poses.objects[chosen], poses.poses[chosen], poses.values[chosen])
+    return BopPoses(poses.images[rows], poses.objects[rows], poses.poses[rows], poses.values[rows])
 
 
 def _within_limit(estimates: BopPoses, limit: int) -> BopPoses:
@@ -133,7 +133,7 @@ def _errors(
     estimates: BopPoses, truth: BopPoses, models: Mapping[int, BopModel], vertices: Mapping[int, Array]
 ) -> tuple[dict[int, list[ImageErrors]], int]:
     """MSSD in metres of every object in every image it occurs in, and the number of results of other objects."""
-    found: dict[int, list[ImageErrors]] = {}
+    by_object: dict[int, list[ImageErrors]] = {}
     used = 0
     keys = np.c_[truth.images, truth.objects]
     ours = np.c_[estimates.images, estimates.objects]
@@ -144,12 +144,12 @@ def _errors(
     }
     for key, there in _groups(keys).items():
         number = key[2]
-        given = places.get(key, np.zeros(0, dtype=np.int64))
-        used += len(given)
-        table = distances[number].distances(estimates.poses[given], truth.poses[there])
-        entry = ImageErrors(table, estimates.values[given], truth.values[there] >= LEAST_VISIBLE)
-        found.setdefault(number, []).append(entry)
-    return dict(sorted(found.items())), len(estimates.values) - used
+        rows = places.get(key, np.zeros(0, dtype=np.int64))
+        used += len(rows)
+        table = distances[number].distances(estimates.poses[rows], truth.poses[there])
+        entry = ImageErrors(table, estimates.values[rows], truth.values[there] >= LEAST_VISIBLE)
+        by_object.setdefault(number, []).append(entry)
+    return dict(sorted(by_object.items())), len(estimates.values) - used
 
 
 def _groups(keys: NDArray[np.int64]) -> dict[tuple[int, ...], NDArray[np.int64]]:

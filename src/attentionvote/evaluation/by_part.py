@@ -31,10 +31,12 @@ def by_part(
         parts: the set, in the order of the ids.
         figures_of: flat figures of one part from the scenes with its results and truth alone.
     """
-    own = {part.name: figures_of([s.of_part(k) for s in scenes], part) for k, part in enumerate(parts.parts)}
+    part_figures = {part.name: figures_of([s.of_part(k) for s in scenes], part) for k, part in enumerate(parts.parts)}
     together: dict[str, Value] = {}
-    for name in dict.fromkeys(name for figures in own.values() for name in figures):
-        values = [figures[name] for figures in own.values() if name in figures]
+    for name in dict.fromkeys(name for figures in part_figures.values() for name in figures):
+        values = [figures[name] for figures in part_figures.values() if name in figures]
         total = sum(values[1:], start=values[0])
         together[name] = total if name.startswith(COUNTS) else total / len(values)
-    return together | {f"{part}/{name}": value for part, figures in own.items() for name, value in figures.items()}
+    return together | {
+        f"{part}/{name}": value for part, figures in part_figures.items() for name, value in figures.items()
+    }

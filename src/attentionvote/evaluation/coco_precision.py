@@ -75,10 +75,10 @@ def coco_precision(images: Sequence[ImageErrors], threshold: float) -> float | N
         matched = truth >= 0
         hit = np.zeros(len(truth), dtype=bool)
         hit[matched] = image.counts[truth[matched]]
-        kept = hit | ~matched
+        counted = hit | ~matched
         # Within an image too by falling score, so that equal scores of several images keep the toolkit's order.
         order = np.argsort(-image.scores, kind="stable")
-        order = order[kept[order]]
+        order = order[counted[order]]
         scores.append(image.scores[order])
         right.append(hit[order])
     order = np.argsort(-np.concatenate(scores), kind="stable")

@@ -1,4 +1,4 @@
-"""Which results of a scene are right: mutual nearest neighbours, at one score or at all of them.
+"""Matching of a scene's results with its truth: mutual nearest neighbours, at one score or at all of them.
 
 A result is right when its nearest ground-truth pose is within the threshold *and* it is, among the
 results that are considered, the nearest to that pose. Not greedy by score: the nearer result wins
@@ -56,8 +56,8 @@ class ScoreCurve:
     @property
     def precision(self) -> Array:
         """TP / (TP + FP), 1 without either."""
-        given = self.true_positives + self.false_positives
-        return np.where(given > 0, self.true_positives / np.maximum(given, 1), 1.0)
+        positives = self.true_positives + self.false_positives
+        return np.where(positives > 0, self.true_positives / np.maximum(positives, 1), 1.0)
 
     @property
     def recall(self) -> Array:
@@ -96,11 +96,11 @@ def match(
         mutual[near] = d.argmin(0)[nearest[near]] == np.flatnonzero(near)
     required = np.zeros(len(order), dtype=bool)
     required[mutual] = to_find[nearest[mutual]]
-    found = np.zeros(len(to_find), dtype=bool)
-    found[nearest[mutual]] = True
+    matched_truth = np.zeros(len(to_find), dtype=bool)
+    matched_truth[nearest[mutual]] = True
 
-    def pairs(chosen: NDArray[np.bool_]) -> Indices:
-        return np.stack([order[chosen], nearest[chosen]], axis=1)[np.argsort(order[chosen])]
+    def pairs(selection: NDArray[np.bool_]) -> Indices:
+        return np.stack([order[selection], nearest[selection]], axis=1)[np.argsort(order[selection])]
 
     return Matching(
         pairs=pairs(mutual),
@@ -108,7 +108,7 @@ def match(
         ignored=np.sort(order[mutual & ~required]),
         duplicates=np.sort(order[near & ~mutual]),
         strays=np.sort(order[~near]),
-        misses=np.flatnonzero(to_find & ~found),
+        misses=np.flatnonzero(to_find & ~matched_truth),
     )
 
 

@@ -78,9 +78,9 @@ def _check_rotations(path: str | Path, key: str, rotations: Array) -> None:
 
 def _matrix(path: str | Path, content: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
     if key not in content:
-        known = [name for name in content if name != "type"]
+        present = [name for name in content if name != "type"]
         raise ValueError(
-            f"{path}: {key} must be given, got only {', '.join(known) or 'type'}{_nearest(key, known, 0.6)}"
+            f"{path}: {key} must be given, got only {', '.join(present) or 'type'}{_nearest(key, present, 0.6)}"
         )
     try:
         value = np.asarray(content[key], dtype=np.float64)

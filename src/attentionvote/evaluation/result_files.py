@@ -79,8 +79,8 @@ def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -
     results = sorted(result_directory.glob("*.json"))
     if not results:
         raise ValueError(f"{result_directory}: at least one NAME.json of results is needed, got none")
-    known = {path.stem for path in gt_directory.glob("*.json")}
-    orphans = [path.name for path in results if path.stem not in known]
+    truth_names = {path.stem for path in gt_directory.glob("*.json")}
+    orphans = [path.name for path in results if path.stem not in truth_names]
     if orphans:
         raise ValueError(
             f"{result_directory}: every result file needs ground truth of the same name in {gt_directory}, "
@@ -91,10 +91,10 @@ def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -
         poses, scores = read_results(path)
         gt_poses, occlusion = read_ground_truth(gt_directory / path.name)
         scenes[path.stem] = SceneResult(poses, scores, gt_poses, occlusion)
-    found, true = (
+    estimated, true = (
         np.concatenate([getattr(s, name)[:, :3, 3] for s in scenes.values()]) for name in ("poses", "gt_poses")
     )
-    if problem := unit_problem(found, true, "metres", "millimetres"):
+    if problem := unit_problem(estimated, true, "metres", "millimetres"):
         raise ValueError(f"{result_directory}: {problem}")
     return scenes
 
@@ -125,11 +125,11 @@ def unit_problem(translations: Array, gt_translations: Array, unit: str, other: 
     """
     if not len(translations) or not len(gt_translations):
         return ""
-    found, true = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (translations, gt_translations))
-    if min(found, true) <= 0 or 0.01 <= found / true <= 100:
+    median, true = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (translations, gt_translations))
+    if min(median, true) <= 0 or 0.01 <= median / true <= 100:
         return ""
     return (
-        f"t must be in {unit}, as the ground truth is, got a median distance of {found:.4g} from the origin "
+        f"t must be in {unit}, as the ground truth is, got a median distance of {median:.4g} from the origin "
         f"where the ground truth has {true:.4g}; it looks like {other}"
     )
 

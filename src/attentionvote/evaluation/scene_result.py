@@ -1,4 +1,4 @@
-"""What was found in one scene, beside what lies in it."""
+"""Results of one scene, beside its ground truth."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ class SceneResult:
         """The scene with only the results and the truth of one part."""
         return self._only(self.part_ids == part_id, self.gt_part_ids == part_id)
 
-    def _only(self, kept: NDArray[np.bool_], true: NDArray[np.bool_]) -> SceneResult:
+    def _only(self, results: NDArray[np.bool_], true: NDArray[np.bool_]) -> SceneResult:
         return SceneResult(
-            self.poses[kept], self.scores[kept], self.gt_poses[true], self.gt_occlusion[true],
-            self.part_ids[kept], self.gt_part_ids[true],
+            self.poses[results], self.scores[results], self.gt_poses[true], self.gt_occlusion[true],
+            self.part_ids[results], self.gt_part_ids[true],
         )  # fmt: skip
 
     def to_find(self, occlusion_limit: float = 0.5) -> NDArray[np.bool_]:

@@ -62,7 +62,11 @@ def evaluate(
         if metric is not None:
             raise ValueError(f"a metric belongs to one part, got one with the {len(part.parts)} parts of {part.name}")
         return by_part(
-            scenes, part, lambda own, one: evaluate(own, one, thresholds, add, None, occlusion_limit, result_limit)
+            scenes,
+            part,
+            lambda part_scenes, member: evaluate(
+                part_scenes, member, thresholds, add, None, occlusion_limit, result_limit
+            ),
         )
     (part,) = part.parts
     if not len(thresholds) or not all(t > 0 for t in thresholds):
@@ -104,21 +108,21 @@ def evaluate_at(scenes: Sequence[SceneResult], part: Parts, working_point: float
         working_point: the score.
     """
     everything = evaluate(scenes, part, add=False)
-    kept = evaluate([scene.above(working_point) for scene in scenes], part, add=add)
+    at_working_point = evaluate([scene.above(working_point) for scene in scenes], part, add=add)
     areas = ("ap_", "map_", "f1_")
-    return everything | {k: v for k, v in kept.items() if not k.rpartition("/")[2].startswith(areas)}
+    return everything | {k: v for k, v in at_working_point.items() if not k.rpartition("/")[2].startswith(areas)}
 
 
 def recall_by_visibility(scenes: Sequence[SceneResult], matchings: Sequence[Matching]) -> dict[str, float]:
     """Share of the ground truth that was found, in bins of its visible fraction; empty bins are absent."""
-    visible, found = [], []
+    visible, hit_masks = [], []
     for scene, matching in zip(scenes, matchings, strict=True):
         # Rounded: 1 - 0.4 and the like must land on the edge they mean.
         visible.append(np.round(1 - scene.gt_occlusion, 9))
         hit = np.zeros(len(scene.gt_poses), dtype=bool)
         hit[matching.pairs[:, 1]] = True
-        found.append(hit)
-    fraction, hits = np.concatenate(visible), np.concatenate(found)
+        hit_masks.append(hit)
+    fraction, hits = np.concatenate(visible), np.concatenate(hit_masks)
     metrics = {}
     for low, high in pairwise(VISIBILITY_EDGES):
         inside = (fraction >= low) & ((fraction < high) | (high == VISIBILITY_EDGES[-1]))
@@ -131,12 +135,12 @@ def pose_errors(scenes: Sequence[SceneResult], matchings: Sequence[Matching], pa
     """Median distance of the origins (mm) and median rotation (degrees, least over the symmetries) of the
     true positives; absent without one."""
     pairs = [matching.true_positives for matching in matchings]
-    found = np.concatenate([scene.poses[pair[:, 0]] for scene, pair in zip(scenes, pairs, strict=True)])
+    estimated = np.concatenate([scene.poses[pair[:, 0]] for scene, pair in zip(scenes, pairs, strict=True)])
     true = np.concatenate([scene.gt_poses[pair[:, 1]] for scene, pair in zip(scenes, pairs, strict=True)])
-    if not len(found):
+    if not len(estimated):
         return {}
-    center_mm = 1000 * np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=-1)
-    rotation = np.degrees(rotation_errors(found, true, part.symmetry))
+    center_mm = 1000 * np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=-1)
+    rotation = np.degrees(rotation_errors(estimated, true, part.symmetry))
     return {"center_error_mm": float(np.median(center_mm)), "rotation_error_deg": float(np.median(rotation))}
 
 
@@ -178,8 +182,10 @@ def curves(
 
 def ap_by_threshold(scenes: Sequence[SceneResult], part: Parts) -> tuple[Array, Array]:
     """Shares of D from 0 to 10 % in steps of half a per cent, and average precision there; of a set the mean."""
-    own = [[scene.of_part(k) for scene in scenes] for k in range(len(part.parts))] if len(part.parts) > 1 else [scenes]
-    each = [curves(results, one) for results, one in zip(own, part.parts, strict=True)]
+    part_scenes = (
+        [[scene.of_part(k) for scene in scenes] for k in range(len(part.parts))] if len(part.parts) > 1 else [scenes]
+    )
+    each = [curves(results, member) for results, member in zip(part_scenes, part.parts, strict=True)]
     return each[0].thresholds, np.mean([curve.ap for curve in each], axis=0)
 
 

@@ -1,1 +1,1 @@
-"""From a checkpoint to a signed bundle: one ONNX graph, proved equal to the checkpoint in task units."""
+"""Signed bundles of checkpoints: one ONNX graph each, proved equal to its checkpoint in task units."""

@@ -60,8 +60,8 @@ def write_bundle(
         (draft / GOLDEN).mkdir(parents=True)
         (draft / MODEL).write_bytes(model)
         (draft / CARD).write_text(card.to_json(), encoding="utf-8")
-        for k, one in enumerate(part.parts):
-            write_surface(one.vertices, one.faces, draft / (MESH if k == 0 else f"part_{one.name}.ply"))
+        for k, member in enumerate(part.parts):
+            write_surface(member.vertices, member.faces, draft / (MESH if k == 0 else f"part_{member.name}.ply"))
         _write_golden(model, card, clouds, golden, draft)
         write_manifest(draft, key)
         bundle = load_bundle(draft, key.public_key())
@@ -69,36 +69,36 @@ def write_bundle(
             problems = self_test(estimator, bundle)
         if problems:
             raise ValueError(f"the bundle must pass its own self-test, but {problems[0]}")
-        place = folder / bundle.digest[:12]
-        if not _is_whole(place, key):
+        bundle_folder = folder / bundle.digest[:12]
+        if not _is_whole(bundle_folder, key):
             _settle(draft)
-            if place.exists():
-                place.rename(old)
-            draft.rename(place)
+            if bundle_folder.exists():
+                bundle_folder.rename(old)
+            draft.rename(bundle_folder)
             sync(folder)
     finally:
         for leftover in (draft, old):
             shutil.rmtree(leftover, ignore_errors=True)
-    point_latest(place)
-    return load_bundle(place, key.public_key())
+    point_latest(bundle_folder)
+    return load_bundle(bundle_folder, key.public_key())
 
 
-def _is_whole(place: Path, key: Ed25519PrivateKey) -> bool:
+def _is_whole(bundle_folder: Path, key: Ed25519PrivateKey) -> bool:
     """Whether a folder holds a bundle that this key signed, with nothing missing, damaged or added."""
     try:
-        load_bundle(place, key.public_key())
+        load_bundle(bundle_folder, key.public_key())
     except BundleError:
         return False
     return True
 
 
-def point_latest(place: Path) -> None:
+def point_latest(bundle_folder: Path) -> None:
     """Point ``latest`` at a bundle in one step: a server that watches it sees the old bundle or the new one."""
-    temporary, link = place.with_name(_LINK), place.with_name(LATEST)
+    temporary, link = bundle_folder.with_name(_LINK), bundle_folder.with_name(LATEST)
     temporary.unlink(missing_ok=True)
-    temporary.symlink_to(place.name)
+    temporary.symlink_to(bundle_folder.name)
     temporary.replace(link)
-    sync(place.parent)
+    sync(bundle_folder.parent)
 
 
 def _write_golden(
@@ -110,14 +110,14 @@ def _write_golden(
             answer = estimator.estimate_parts_only(points)
             if not isinstance(answer, Estimate) or answer.detections[0].confidence < clear:
                 continue  # it would test nothing
-            found = answer.detections
+            detections = answer.detections
             arrays: dict[str, NDArray] = {
                 "points": points,
-                "camera_from_part": np.stack([d.camera_from_part for d in found]),
-                "confidence": np.array([d.confidence for d in found], dtype=np.float32),
+                "camera_from_part": np.stack([d.camera_from_part for d in detections]),
+                "confidence": np.array([d.confidence for d in detections], dtype=np.float32),
             }
             if card.parts:
-                arrays["part_ids"] = np.array([card.classes.index(d.part) for d in found], dtype=np.int64)
+                arrays["part_ids"] = np.array([card.classes.index(d.part) for d in detections], dtype=np.int64)
             np.savez(draft / GOLDEN / f"{name}.npz", **arrays)  # type: ignore[arg-type]
             written += 1
             if written == count:

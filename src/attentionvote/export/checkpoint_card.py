@@ -77,9 +77,9 @@ def model_card(
     if threshold is None:
         raise ValueError("the checkpoint must be of a finished training (model.ckpt), got one without a working point")
     stored, parts = metadata["part"], metadata.get("parts", ())
-    if [one.digest for one in part.parts] != [one["digest"] for one in parts or [stored]]:
+    if [member.digest for member in part.parts] != [member["digest"] for member in parts or [stored]]:
         raise ValueError(f"the checkpoint must be of {part.name} as it is now, got one of other parts: train it again")
-    cards = tuple(_part_card(facts, one.box) for facts, one in zip(parts, part.parts, strict=False))
+    cards = tuple(_part_card(facts, member.box) for facts, member in zip(parts, part.parts, strict=False))
     radius = model.test_voting_radius
     return ModelCard(
         part=_part_card(stored, part.box),

@@ -39,8 +39,8 @@ def ball_query(op: Any, blocks: Blocks, centers: ir.Value, number: int, radius: 
         points = op.Reshape(op.Gather(blocks.points, block, axis=1), [3, 1, -1])
         label = op.Reshape(op.Gather(blocks.label, block, axis=0), [-1])
         inside = op.LessOrEqual(squared_length(op, op.Sub(points, centers)), limit)
-        found, _ = op.TopK(op.Where(inside, label, NOWHERE), [count], axis=2, largest=0, sorted=1, _outputs=2)
-        return op.Identity(carry), found
+        nearest_labels, _ = op.TopK(op.Where(inside, label, NOWHERE), [count], axis=2, largest=0, sorted=1, _outputs=2)
+        return op.Identity(carry), nearest_labels
 
     body = inner(
         op,
@@ -51,9 +51,9 @@ def ball_query(op: Any, blocks: Blocks, centers: ir.Value, number: int, radius: 
     )
     chunks = op.Unsqueeze(op.Transpose(together.points, perm=[1, 0, 2]), [3])
     start = constant(op, np.zeros(1, np.float32))
-    found = op.Scan(start, chunks, within_reach, body=body, num_scan_inputs=2, _outputs=2)[1]
+    neighbors = op.Scan(start, chunks, within_reach, body=body, num_scan_inputs=2, _outputs=2)[1]
     # Back into the order of the centres; a place that repeats another centre comes last.
-    _, place = op.TopK(op.Reshape(together.label, [-1]), [number], largest=0, sorted=1, _outputs=2)
-    found = op.Gather(op.Reshape(found, [-1, count]), place, axis=0)
-    found = op.Where(op.Less(found, NOWHERE), found, op.Slice(found, [0], [1], [1]))
-    return op.Cast(found, to=INT)
+    _, position = op.TopK(op.Reshape(together.label, [-1]), [number], largest=0, sorted=1, _outputs=2)
+    neighbors = op.Gather(op.Reshape(neighbors, [-1, count]), position, axis=0)
+    neighbors = op.Where(op.Less(neighbors, NOWHERE), neighbors, op.Slice(neighbors, [0], [1], [1]))
+    return op.Cast(neighbors, to=INT)

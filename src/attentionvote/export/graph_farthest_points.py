@@ -46,10 +46,10 @@ def farthest_points(op: Any, planes: ir.Value, blocks: Blocks, number: int, coun
     nearest = op.Reshape(squared_length(op, op.Sub(planes, first)), [number])
 
     def body(op: Any, _: ir.Value, __: ir.Value, nearest: ir.Value, order: ir.Value) -> tuple[ir.Value, ...]:
-        chosen, most = _choose(op, planes, nearest, min(CANDIDATES, number))
-        nearest = _lowered(op, planes, blocks, nearest, chosen, most)
-        order = op.Concat(order, chosen, axis=0)
-        progress = op.Greater(op.Shape(chosen), constant(op, [0]))
+        added, most = _choose(op, planes, nearest, min(CANDIDATES, number))
+        nearest = _lowered(op, planes, blocks, nearest, added, most)
+        order = op.Concat(order, added, axis=0)
+        progress = op.Greater(op.Shape(added), constant(op, [0]))
         return op.And(progress, op.Less(op.Shape(order), constant(op, [count]))), nearest, order
 
     step = inner(
@@ -85,15 +85,13 @@ def _choose(op: Any, planes: ir.Value, nearest: ir.Value, size: int) -> tuple[ir
     settled = op.Less(places, op.ReduceMin(op.Where(op.Equal(free, before), size, places), keepdims=0))
     by_free = op.And(lowers, op.Greater(op.Transpose(free, perm=[0, 2, 1]), 0.0))
     fallen = op.ReduceMax(op.Where(by_free, table, 0.0), keepdims=0)
-    chosen = op.Where(op.And(op.Greater(squared, fallen), settled), free, 0.0)
-    return op.Gather(candidate, op.Gather(op.NonZero(chosen), 2, axis=0)), op.Slice(squared, [0], [1])
+    settled_free = op.Where(op.And(op.Greater(squared, fallen), settled), free, 0.0)
+    return op.Gather(candidate, op.Gather(op.NonZero(settled_free), 2, axis=0)), op.Slice(squared, [0], [1])
 
 
-def _lowered(
-    op: Any, planes: ir.Value, blocks: Blocks, nearest: ir.Value, chosen: ir.Value, most: ir.Value
-) -> ir.Value:
+def _lowered(op: Any, planes: ir.Value, blocks: Blocks, nearest: ir.Value, added: ir.Value, most: ir.Value) -> ir.Value:
     """The squared distances when more points are chosen."""
-    points = op.Unsqueeze(op.Gather(planes, chosen, axis=1), [2])
+    points = op.Unsqueeze(op.Gather(planes, added, axis=1), [2])
     pairs = op.NonZero(op.Less(squared_gap(op, blocks, points, points), most))
     point, block = op.Gather(pairs, 1, axis=0), op.Gather(pairs, 2, axis=0)
     squared = squared_length(op, op.Sub(op.Gather(blocks.points, block, axis=1), op.Gather(points, point, axis=1)))

@@ -71,12 +71,12 @@ class GraphSetAbstraction(nn.Module):
 def _pair_features(near: Float[Tensor, "rows 6"], middle: Float[Tensor, "centers 6"]) -> Float[Tensor, "channels rows"]:
     """What ``pair_features`` is made of, by planes, all neighbours of a centre in succession: offset, normal, distance,
     and the products whose sums are the cosines."""
-    planes, own = near.T.reshape(6, len(middle), -1), middle.T[:, :, None]
-    offset, normal, own_normal = planes[:3] - own[:3], planes[3:], own[3:]
+    planes, center_planes = near.T.reshape(6, len(middle), -1), middle.T[:, :, None]
+    offset, normal, center_normal = planes[:3] - center_planes[:3], planes[3:], center_planes[3:]
     squared = torch.ones(1, 3) @ (offset * offset).view(3, -1)
     distance = squared.sqrt().view(1, len(middle), -1)
     unit = offset / (distance + TINY)
-    channels = torch.cat([offset, normal, distance, own_normal * unit, normal * unit, own_normal * normal])
+    channels = torch.cat([offset, normal, distance, center_normal * unit, normal * unit, center_normal * normal])
     return channels.view(len(channels), -1)
 
 
@@ -132,8 +132,8 @@ class GraphRefiner(nn.Module):
             box_from_camera = torch.cat([turn.transpose(1, 2) / half[:, None], shift], dim=2)
             x, y, z = (box_from_camera @ away).abs().unbind(1)
             inside = torch.maximum(torch.maximum(x, y), z) <= 1
-            found, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count, dim=1)
-            number = (found > 0).sum(1, keepdim=True)
+            inside_rank, index = torch.topk(torch.where(inside, rank, torch.zeros_like(rank)), count, dim=1)
+            number = (inside_rank > 0).sum(1, keepdim=True)
             index = torch.gather(index, 1, torch.arange(layer.points) % number.clamp(min=1))
             offset = torch.cat([center, torch.zeros_like(center)], dim=1)[:, None]
             seen = (embedding(index, fixed["cloud"]) - offset).view(chunk, 2 * layer.points, 3) @ turn
@@ -182,11 +182,11 @@ class GraphHeatmap(Heatmap):
         index = torch.arange(total, dtype=torch.float32)
 
         def beat(block: Sequence[Tensor], shared: tuple[list[Tensor], Tensor, Tensor]) -> list[Tensor]:
-            (voxels, own, number), (columns, heat, index) = block, shared
+            (voxels, row_heat, number), (columns, heat, index) = block, shared
             dx, dy, dz = (d.abs() for d in differences(voxels, columns))
             near = torch.maximum(torch.maximum(dx, dy), dz) <= window
             least = torch.where(index < number[:, None], _JUST_BELOW, TIE)
-            ahead = torch.where(near, heat - own[:, None] - least, -1.0)
+            ahead = torch.where(near, heat - row_heat[:, None] - least, -1.0)
             return [(ahead.amax(1) > 0).to(heat.dtype)]
 
         rows = (blocks, heat.view(-1, chunk).clone(), index.view(-1, chunk).clone())

@@ -35,26 +35,26 @@ def shapes_of(layout: Layout) -> list[tuple[int, ...]]:
 
 
 def find_neighborhoods(
-    points: Float[Tensor, "1 points 3"], layout: Layout, given: Sequence[Int[Tensor, "*sizes"]]
+    points: Float[Tensor, "1 points 3"], layout: Layout, order_and_neighbors: Sequence[Int[Tensor, "*sizes"]]
 ) -> Neighborhoods:
     """``model.neighborhoods.find_neighborhoods`` of a batch of one, in standard operators.
 
     Args:
         points: metres.
         layout: the levels.
-        given: order and neighbours, taken as they are; found where they are empty.
+        order_and_neighbors: taken as they are; computed where they are empty.
     """
     cloud = points[0]
     sizes = {"centers": layout.centers, "neighbors": layout.neighbors, "radii": layout.radii}
-    order, *neighbors = traced_operator("Neighborhoods", [cloud, *given], sizes, shapes_of(layout))
+    order, *neighbors = traced_operator("Neighborhoods", [cloud, *order_and_neighbors], sizes, shapes_of(layout))
     ordered = cloud[order]
     pairs = ((layout.centers[3], layout.centers[2]), (layout.centers[2], layout.centers[1]))
-    found = [three_nearest(ordered[:coarse], ordered[:fine]) for coarse, fine in pairs]
+    interpolation = [three_nearest(ordered[:coarse], ordered[:fine]) for coarse, fine in pairs]
     return Neighborhoods(
         order[None],
         tuple(n[None] for n in neighbors),
-        tuple(index[None] for index, _ in found),
-        tuple(weight[None] for _, weight in found),
+        tuple(index[None] for index, _ in interpolation),
+        tuple(weight[None] for _, weight in interpolation),
     )
 
 
@@ -77,7 +77,12 @@ def _farthest_points(op: Any, points: ir.Value, count: int) -> ir.Value:
 
 @operator("Neighborhoods")
 def _neighborhoods(
-    op: Any, points: ir.Value, *given: ir.Value, centers: list[int], neighbors: list[int], radii: list[float]
+    op: Any,
+    points: ir.Value,
+    *order_and_neighbors: ir.Value,
+    centers: list[int],
+    neighbors: list[int],
+    radii: list[float],
 ) -> list[ir.Value]:
     shapes = [centers[:1], *([size, count] for size, count in zip(centers, neighbors, strict=True))]
 
@@ -85,12 +90,12 @@ def _neighborhoods(
         return [value(f"{name}_{level}", INT, shape) for level, shape in enumerate(shapes)]
 
     def take(op: Any) -> list[ir.Value]:
-        return [op.Reshape(one, shape) for one, shape in zip(given, shapes, strict=True)]
+        return [op.Reshape(indices, shape) for indices, shape in zip(order_and_neighbors, shapes, strict=True)]
 
     def find(op: Any) -> list[ir.Value]:
-        return _found(op, points, centers, neighbors, radii)
+        return _searched(op, points, centers, neighbors, radii)
 
-    nothing = op.Equal(op.Size(given[0]), constant(op, 0))
+    nothing = op.Equal(op.Size(order_and_neighbors[0]), constant(op, 0))
     branches = {
         "then_branch": inner(op, "find", find, [], spaces("found")),
         "else_branch": inner(op, "take", take, [], spaces("taken")),
@@ -98,19 +103,21 @@ def _neighborhoods(
     return list(op.If(nothing, **branches, _outputs=len(shapes)))
 
 
-def _found(op: Any, points: ir.Value, centers: list[int], neighbors: list[int], radii: list[float]) -> list[ir.Value]:
+def _searched(
+    op: Any, points: ir.Value, centers: list[int], neighbors: list[int], radii: list[float]
+) -> list[ir.Value]:
     below, number = op.Transpose(points, perm=[1, 0]), _number(points)
     blocks = in_blocks(op, below, number, max(_block(number), neighbors[0]))
     order = farthest_points(op, below, blocks, number, centers[0])
     ordered = op.Gather(below, order, axis=1)
-    found: list[ir.Value] = []
+    levels: list[ir.Value] = []
     for size, count, radius in zip(centers, neighbors, radii, strict=True):
-        chosen = op.Slice(ordered, [0], [size], [1])
-        if found:
+        middle = op.Slice(ordered, [0], [size], [1])
+        if levels:
             blocks = in_blocks(op, below, number, max(_block(number), count))
-        found.append(ball_query(op, blocks, chosen, size, radius, count))
-        below, number = chosen, size
-    return [order, *found]
+        levels.append(ball_query(op, blocks, middle, size, radius, count))
+        below, number = middle, size
+    return [order, *levels]
 
 
 def _number(points: ir.Value) -> int:

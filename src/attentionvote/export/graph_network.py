@@ -49,10 +49,20 @@ class ExportNetwork(nn.Module):
         self.model = _replaced(copy.deepcopy(model, shared).eval())
 
     def forward(
-        self, points: Float[Tensor, "1 points 3"], normals: Float[Tensor, "1 points 3"], *given: Int[Tensor, "*sizes"]
+        self,
+        points: Float[Tensor, "1 points 3"],
+        normals: Float[Tensor, "1 points 3"],
+        *order_and_neighbors: Int[Tensor, "*sizes"],
     ) -> Predictions:
-        """What ``AttentionVote.forward`` answers for the same cloud; ``given``: see ``find_neighborhoods``."""
-        predictions: Predictions = self.model(points, normals, find_neighborhoods(points, self.model.layout, given))
+        """What ``AttentionVote.forward`` answers for the same cloud.
+
+        Args:
+            points, normals: as there.
+            order_and_neighbors: see ``find_neighborhoods``.
+        """
+        predictions: Predictions = self.model(
+            points, normals, find_neighborhoods(points, self.model.layout, order_and_neighbors)
+        )
         return predictions
 
 

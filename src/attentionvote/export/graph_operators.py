@@ -80,13 +80,13 @@ def write_out(model: ir.Model) -> None:
 
 def make_optional(model: ir.Model, names: Sequence[str]) -> None:
     """Give inputs a default that is empty along their first dimension: a run may leave them out."""
-    for given in model.graph.inputs:
-        if given.name in names:
-            assert given.shape is not None
-            rest = [length for length in given.shape[1:] if isinstance(length, int)]
-            given.shape = ir.Shape([f"{given.name}_length", *rest])
-            given.const_value = ir.tensor(np.zeros([0, *rest], np.int64), name=given.name)
-            model.graph.register_initializer(given)
+    for graph_input in model.graph.inputs:
+        if graph_input.name in names:
+            assert graph_input.shape is not None
+            rest = [length for length in graph_input.shape[1:] if isinstance(length, int)]
+            graph_input.shape = ir.Shape([f"{graph_input.name}_length", *rest])
+            graph_input.const_value = ir.tensor(np.zeros([0, *rest], np.int64), name=graph_input.name)
+            model.graph.register_initializer(graph_input)
 
 
 def constant(op: Any, values: ArrayLike) -> ir.Value:

@@ -28,8 +28,8 @@ def in_blocks(
     """
     leaves, structure = pytree.tree_flatten(shared)
 
-    def body(carry: Tensor, *given: Tensor) -> list[Tensor]:
-        answers = step(given[: len(blocks)], pytree.tree_unflatten(given[len(blocks) :], structure))
+    def body(carry: Tensor, *inputs: Tensor) -> list[Tensor]:
+        answers = step(inputs[: len(blocks)], pytree.tree_unflatten(inputs[len(blocks) :], structure))
         return [carry.clone(), *answers]  # a scan must carry something
 
     _, *rows = scan_op(body, [torch.zeros(1)], list(blocks), additional_inputs=tuple(leaves))

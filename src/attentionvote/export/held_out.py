@@ -59,18 +59,18 @@ def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> Scene
     )
 
 
-def _read_again(kept: dict[str, Any], part: Parts, wanted: str) -> DatasetSplit:
-    folder = Path(kept["folder"])
+def _read_again(record: dict[str, Any], part: Parts, wanted: str) -> DatasetSplit:
+    folder = Path(record["folder"])
     try:
-        found = DatasetSplits.open(folder, part.parts[0], kept["held_out"]).splits["test"]
+        test_scenes = DatasetSplits.open(folder, part.parts[0], record["held_out"]).splits["test"]
     except UnknownLayout as error:
         raise ValueError(f"the dataset that the network was trained on must be where it was: {error}") from error
-    if found.digest != wanted:
+    if test_scenes.digest != wanted:
         raise ValueError(
             f"{folder} must hold the test scenes {wanted[:12]} that the network was trained with, got "
-            f"{found.digest[:12]}: the dataset has changed, train it again"
+            f"{test_scenes.digest[:12]}: the dataset has changed, train it again"
         )
-    return found
+    return test_scenes
 
 
 def measured(scenes: SceneSet | DatasetSplit, part: Parts, settings: CloudSettings, root: Path, workers: int) -> Clouds:

@@ -77,9 +77,9 @@ def check_graph(graph: onnx.ModelProto, card: ModelCard) -> None:
         ("inputs", card.inputs, [value for value in graph.graph.input if value.name not in optional]),
         ("outputs", card.outputs, graph.graph.output),
     ):
-        found = tuple(_spec(value) for value in actual)
-        if found != expected:
-            raise ValueError(f"the exported graph must have the {kind} {expected}, got {found}")
+        exported = tuple(_spec(value) for value in actual)
+        if exported != expected:
+            raise ValueError(f"the exported graph must have the {kind} {expected}, got {exported}")
 
 
 @contextmanager

@@ -50,7 +50,9 @@ def measure_parity(
     sides: tuple[list[SceneResult], list[SceneResult]] = ([], [])
     for batch in samples:
         with torch.no_grad():
-            sides[0].extend(scene_results(model(batch.points, batch.normals, batch.found), batch, peak_threshold))
+            sides[0].extend(
+                scene_results(model(batch.points, batch.normals, batch.neighborhoods), batch, peak_threshold)
+            )
         outputs = graph(batch.points.numpy(), batch.normals.numpy())
         for name, values in outputs.items():
             if not np.isfinite(values).all():
@@ -68,20 +70,20 @@ def compare(
     A detection (confidence at the threshold or above) may find its partner among all proposals of the other side: one
     that stands a rounding error below the threshold is a partner still. Of a set of parts, partners have one name.
     """
-    metrics = [PoseMetric.of(one) for one in part.parts]
+    metrics = [PoseMetric.of(member) for member in part.parts]
     shift, turn, trust, unmatched = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [0]
     for whole_a, whole_b in zip(ours, theirs, strict=True):
         lonely = 0
         in_scene = [np.zeros(0)]
-        for k, (one, metric) in enumerate(zip(part.parts, metrics, strict=True)):
+        for k, (member, metric) in enumerate(zip(part.parts, metrics, strict=True)):
             a, b = whole_a.of_part(k), whole_b.of_part(k)
-            i, j = _partners(metric, a, b, PARTNER * one.diameter)
+            i, j = _partners(metric, a, b, PARTNER * member.diameter)
             sure_a, sure_b = a.scores >= confidence_threshold, b.scores >= confidence_threshold
             lonely += int(sure_a.sum() - sure_a[i].sum() + sure_b.sum() - sure_b[j].sum())
-            kept = sure_a[i] | sure_b[j]
-            i, j = i[kept], j[kept]
+            sure = sure_a[i] | sure_b[j]
+            i, j = i[sure], j[sure]
             in_scene.append(1000 * np.linalg.norm(a.poses[i, :3, 3] - b.poses[j, :3, 3], axis=-1))
-            turn.append(np.degrees(rotation_errors(a.poses[i], b.poses[j], one.symmetry)))
+            turn.append(np.degrees(rotation_errors(a.poses[i], b.poses[j], member.symmetry)))
             trust.append(np.abs(a.scores[i] - b.scores[j]))
         shift.append(np.concatenate(in_scene))
         unmatched.append(lonely)

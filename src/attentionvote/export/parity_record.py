@@ -1,4 +1,4 @@
-"""What a proof of equality measured, what it may have measured at most, and how it is shown and kept."""
+"""Record of a proof of equality: its measurements, their limits, and their stored and printed forms."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def prove(
         batch = next(held_out.samples(clouds, list(indices[-1:]), card.points, model.layout))
         points, normals = batch.points.numpy(), batch.normals.numpy()
         # Sampling and neighbours are given to plain torch: the slow references of those would only flatter the graph.
-        eager = partial(model, batch.points, batch.normals, batch.found)
+        eager = partial(model, batch.points, batch.normals, batch.neighborhoods)
         work: dict[str, Callable[[], object]] = {
             "torch with C kernels": partial(model, batch.points, batch.normals),
             EAGER: native.disabled()(eager),

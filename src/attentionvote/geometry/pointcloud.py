@@ -1,4 +1,4 @@
-"""From depth to the network's input: back-projection, normals, sampling. One code for training and cell.
+"""The network's input from a depth image: back-projection, normals, sampling. One code for training and cell.
 
 Training on normals of another estimator than the cell's would be training on another sensor (14 degrees apart
 on average between ray-cast and PCA normals), so both sides call ``estimate_normals``.
@@ -92,7 +92,7 @@ def estimate_normals(
     clouds = [np.ascontiguousarray(a, dtype=np.float32) for a in (points, asked)]
     normals = np.empty_like(clouds[1])
     sort = libraries[0].morton_order
-    served = all(native.call(sort, c, len(c), found) for c, found in zip(clouds, (order, turn), strict=True))
+    served = all(native.call(sort, c, len(c), ranks) for c, ranks in zip(clouds, (order, turn), strict=True))
     arguments = clouds[0], order, len(points), clouds[1], turn, len(asked), nearest, normals
     if served and native.call(libraries[1].normals, *arguments):
         return normals

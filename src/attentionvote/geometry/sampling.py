@@ -1,4 +1,4 @@
-"""Which points and neighbours the network sees: farthest-point order, ball query, nearest three.
+"""Points and neighbours that the network sees: farthest-point order, ball query, nearest three.
 
 Each operator has a C implementation (``pointops.c``, compiled once per machine with the system's C compiler,
 no torch headers, no CUDA) and a slow numpy reference in ``sampling_reference``, which is its oracle in the
@@ -67,10 +67,10 @@ def ball_query(
         raise ValueError(f"count must be at least 1, got {count}")
     library = native.load("attentionvote.geometry", "pointops.c")
     neighbors = np.empty((len(middle), count), dtype=np.int32)
-    found = np.empty(len(middle), dtype=np.int32)
-    arguments = xyz, len(xyz), middle, len(middle), float(radius), count, neighbors, found
+    neighbor_counts = np.empty(len(middle), dtype=np.int32)
+    arguments = xyz, len(xyz), middle, len(middle), float(radius), count, neighbors, neighbor_counts
     if library is not None and native.call(library.ball_query, *arguments):
-        return neighbors.astype(np.int64), found.astype(np.int64)
+        return neighbors.astype(np.int64), neighbor_counts.astype(np.int64)
     return sampling_reference.ball_query(xyz, middle, radius, count)
 
 
@@ -87,11 +87,11 @@ def level_neighbors(
         centers, neighbors, radii: S_l, k_l and metres by level.
     """
     order = farthest_point_order(points, centers[0])
-    ordered, below, found = points[order], points, []
+    ordered, below, level_indices = points[order], points, []
     for size, count, radius in zip(centers, neighbors, radii, strict=True):
-        found.append(ball_query(below, ordered[:size], radius, count)[0])
+        level_indices.append(ball_query(below, ordered[:size], radius, count)[0])
         below = ordered[:size]
-    return order, found
+    return order, level_indices
 
 
 def three_nearest(

@@ -27,7 +27,7 @@ def ball_query(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """See ``sampling.ball_query``; one pass over all points for every centre."""
     neighbors = np.zeros((len(centers), count), dtype=np.int64)
-    found = np.zeros(len(centers), dtype=np.int64)
+    neighbor_counts = np.zeros(len(centers), dtype=np.int64)
     with np.errstate(over="ignore"):
         limit = min(np.square(np.float32(radius)), np.nextafter(_LARGEST, np.float32(0)))
     for row, center in enumerate(centers):
@@ -35,8 +35,8 @@ def ball_query(
         if len(inside):
             neighbors[row] = inside[0]
             neighbors[row, : len(inside)] = inside
-        found[row] = len(inside)
-    return neighbors, found
+        neighbor_counts[row] = len(inside)
+    return neighbors, neighbor_counts
 
 
 def three_nearest(

@@ -49,10 +49,10 @@ class Symmetry:
         if self.kind not in get_args(Kind):
             raise ValueError(f"symmetry kind must be one of {', '.join(get_args(Kind))}, got {self.kind!r}")
         for name in ("axis", "flip_axis"):
-            given = getattr(self, name)
-            value = np.asarray(given, dtype=np.float64)
+            raw = getattr(self, name)
+            value = np.asarray(raw, dtype=np.float64)
             if value.shape != (3,) or not np.isfinite(value).all() or np.linalg.norm(value) < 1e-9:
-                raise ValueError(f"symmetry {name} must be three finite numbers, not all zero, got {given}")
+                raise ValueError(f"symmetry {name} must be three finite numbers, not all zero, got {raw}")
             unit = value / np.linalg.norm(value)
             object.__setattr__(self, name, (float(unit[0]), float(unit[1]), float(unit[2])))
         if self.kind in ("cyclic", "dihedral") and (self.order < 2 or self.order != int(self.order)):

@@ -84,14 +84,14 @@ def ppf_results(
     """
     check_opencv()
     task = PpfTask(part, settings or PpfSettings())
-    found: list[SceneResult | None] = [None] * len(scenes)
+    scene_results: list[SceneResult | None] = [None] * len(scenes)
     seconds = np.zeros(len(scenes))
     try:
         with closing(run_all(task, scenes, executor, workers=workers)) as results:
             for index, (detections, elapsed) in shown(results):
                 scene = scenes[index]
                 occlusion = 1.0 - np.minimum(scene.visible_fraction, 1.0)
-                found[index] = SceneResult(
+                scene_results[index] = SceneResult(
                     detections.camera_from_part, detections.scores, scene.camera_from_part, occlusion
                 )
                 seconds[index] = elapsed
@@ -100,4 +100,4 @@ def ppf_results(
             f"a worker process died in the PPF baseline (out of memory? {error.how}) {error.times} times at scene "
             f"{error.job}"
         ) from error
-    return [result for result in found if result is not None], seconds
+    return [result for result in scene_results if result is not None], seconds

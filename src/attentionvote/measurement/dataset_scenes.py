@@ -39,15 +39,15 @@ class DatasetScenes:
         Raises:
             ValueError: with one sentence, when it is none or another, or the part's frame is not the dataset's.
         """
-        found = open_datasets(folder)
-        if len(found) != 1 or len(found[0].parts) != 1:
-            held = ", ".join(f"{one.title} {one.split}" for one in found) or "none"
+        datasets = open_datasets(folder)
+        if len(datasets) != 1 or len(datasets[0].parts) != 1:
+            held = ", ".join(f"{dataset.title} {dataset.split}" for dataset in datasets) or "none"
             raise ValueError(
                 f"{folder} must hold one dataset of one object, got {held}: name the folder of one of them"
             )
-        scenes = cls(found[0], part, density)
+        scenes = cls(datasets[0], part, density)
         if not len(scenes):
-            raise ValueError(f"{folder} must hold scenes with at least five parts, got {len(found[0].names)} others")
+            raise ValueError(f"{folder} must hold scenes with at least five parts, got {len(datasets[0].names)} others")
         scenes.check_frame()
         return scenes
 
@@ -79,8 +79,8 @@ class DatasetScenes:
         Raises:
             ValueError: with one sentence.
         """
-        kept = trained_with.get("cycles", "")
-        learned = {kept[i : i + SHORT] for i in range(0, len(kept), SHORT)}
+        cycle_digests = trained_with.get("cycles", "")
+        learned = {cycle_digests[i : i + SHORT] for i in range(0, len(cycle_digests), SHORT)}
         cycles = DatasetSplit(self.dataset, self.dataset.scored_names, self.part).cycles
         seen = [name for name, digest in cycles.items() if digest[:SHORT] in learned]
         if self.dataset.written_from in trained_with.values():
@@ -95,10 +95,10 @@ class DatasetScenes:
         """Every scored scene without its background, at most ``density`` points."""
         for name in self.dataset.scored_names:
             scene = self.dataset.scene(name)
-            kept = sample_indices(len(scene.points), min(self.density, len(scene.points)), np.random.default_rng(0))
+            rows = sample_indices(len(scene.points), min(self.density, len(scene.points)), np.random.default_rng(0))
             yield Scene(
-                scene.points[kept],
-                scene.instance_ids[kept],
+                scene.points[rows],
+                scene.instance_ids[rows],
                 scene.camera_from_part,
                 np.clip(scene.visible_fraction, 0.0, 1.0),
                 scene.part_ids,

@@ -1,4 +1,4 @@
-"""What models find in the frozen evaluation set: exported bundles through the estimator that cells run.
+"""Measurement of models on the frozen evaluation set: exported bundles through the estimator that cells run.
 
 The set has drop cycles of its own, which no training, validation or test has seen, and one digest of everything that
 makes its clouds. Several models are measured in one go, scene by scene, so that nothing but the model differs.
@@ -47,8 +47,8 @@ class Measurement:
     def figures(self, part: Parts) -> dict[str, float]:
         """Flat figures: ``evaluation.evaluate_at``, and ``latency_p50_ms``, ``latency_p95_ms``."""
         p50, p95 = (1000 * float(np.percentile(self.seconds, q)) for q in (50, 95))
-        found = evaluate_at(self.results, part, self.working_point)
-        return found | {"latency_p50_ms": p50, "latency_p95_ms": p95}
+        figures = evaluate_at(self.results, part, self.working_point)
+        return figures | {"latency_p50_ms": p50, "latency_p95_ms": p95}
 
     def resampled(self, part: Parts, draws: int = DRAWS) -> dict[str, Array]:
         """Figures of every bootstrap draw; those of two models on one set belong together draw by draw."""
@@ -89,7 +89,7 @@ def measure(
                 f"{bundle.card.part.name} {bundle.card.part.digest[:12]}: the part has changed, train it again"
             )
     estimators = [_all_proposals(bundle, threads, peak_threshold) for bundle in bundles]
-    found: list[list[SceneResult]] = [[] for _ in bundles]
+    scene_results: list[list[SceneResult]] = [[] for _ in bundles]
     seconds: list[list[float]] = [[] for _ in bundles]
     for number, cloud in enumerate(shown(scenes.clouds())):
         occlusion = 1.0 - np.minimum(cloud.visible_fraction, 1.0)
@@ -103,13 +103,13 @@ def measure(
             scores = np.array([d.confidence for d in detections])
             named = np.array([bundles[which].card.classes.index(d.part) for d in detections], dtype=np.int64)
             truth = cloud.camera_from_part, occlusion
-            found[which].append(SceneResult(poses, scores, *truth, named, cloud.part_ids))
+            scene_results[which].append(SceneResult(poses, scores, *truth, named, cloud.part_ids))
             seconds[which].append(answer.seconds["total"])
     for estimator in estimators:
         estimator.close()
     return [
         Measurement(bundle.digest, results, bundle.card.confidence_threshold, np.array(times))
-        for bundle, results, times in zip(bundles, found, seconds, strict=True)
+        for bundle, results, times in zip(bundles, scene_results, seconds, strict=True)
     ]
 
 

@@ -48,14 +48,18 @@ class SetAbstraction(nn.Module):
     ) -> Float[Tensor, "batch centers out"]:
         """Features of the centres; ``neighbors`` are indices into ``points``."""
         batch, count, _ = centers.shape
+        # [b, s, h] indices within a sample -> [b * s, h] rows of all samples' points
         first_row = torch.arange(batch, device=xyz.device)[:, None, None] * xyz.shape[1]
         index = (neighbors + first_row).flatten(0, 1)
+        # [b, n, 3] -> [b * n, 3], and of the centres [b, s, 3] -> [b * s, 3]
         flat = [t.reshape(-1, 3) for t in (xyz, normals, centers, center_normals)]
         geometry = pair_features(flat[0], flat[1], flat[2], flat[3], index, self.radius)
         projected = None
         if self.project is not None and features is not None:
+            # [b, n, c] -> [b * n, c]
             projected = self.project(features.reshape(-1, features.shape[-1]))
         pooled = pooled_mlp(geometry, projected, index, list(self.weights))
+        # [b * s, c] -> [b, s, c]
         return self.finish(pooled).view(batch, count, -1)
 
     def finish(self, pooled: Float[Tensor, "rows width"]) -> Float[Tensor, "rows width"]:
@@ -74,7 +78,7 @@ class FeaturePropagation(nn.Module):
     def forward(
         self,
         coarse: Float[Tensor, "batch coarse channels"],
-        fine: Float[Tensor, "batch fine own"],
+        fine: Float[Tensor, "batch fine fine_channels"],
         nearest: Int[Tensor, "batch fine 3"],
         weights: Float[Tensor, "batch fine 3"],
     ) -> Float[Tensor, "batch fine out"]:
@@ -111,19 +115,22 @@ class Backbone(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        found: Neighborhoods,
+        neighborhoods: Neighborhoods,
     ) -> tuple[Float[Tensor, "batch seeds 3"], Float[Tensor, "batch seeds features"]]:
         """Positions and features of the seeds."""
         batch = torch.arange(len(points), device=points.device)[:, None]
-        ordered, ordered_normals = points[batch, found.order], normals[batch, found.order]
+        # [b, n, 3] -> [b, s, 3], s of the first level
+        ordered, ordered_normals = points[batch, neighborhoods.order], normals[batch, neighborhoods.order]
         xyz, directions = points, normals
         features: Tensor | None = None
         levels: list[Tensor] = []
-        for layer, size, neighbors in zip(self.abstractions, self.layout.centers, found.neighbors, strict=True):
+        for layer, size, neighbors in zip(self.abstractions, self.layout.centers, neighborhoods.neighbors, strict=True):
+            # [b, s, 3] -> [b, size, 3]: every level's centres are a prefix
             centers, center_normals = ordered[:, :size], ordered_normals[:, :size]
             features = layer(xyz, directions, features, centers, center_normals, neighbors)
             levels.append(features)
             xyz, directions = centers, center_normals
-        third = self.propagation_3(levels[3], levels[2], found.nearest[0], found.weights[0])
-        seeds = self.propagation_2(third, levels[1], found.nearest[1], found.weights[1])
+        third = self.propagation_3(levels[3], levels[2], neighborhoods.nearest[0], neighborhoods.weights[0])
+        seeds = self.propagation_2(third, levels[1], neighborhoods.nearest[1], neighborhoods.weights[1])
+        # [b, s, 3] -> [b, m, 3]
         return ordered[:, : self.layout.seeds], seeds

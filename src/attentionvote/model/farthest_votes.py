@@ -27,6 +27,7 @@ class FarthestVotes(nn.Module):
         last = torch.zeros(len(votes), 1, dtype=torch.long, device=votes.device)
         order = [last]
         for _ in range(count - 1):
+            # [b, m] - [b, 1]
             dx, dy, dz = (a - torch.take_along_dim(a, last, dim=1) for a in (x, y, z))
             nearest = torch.minimum(nearest, dx * dx + dy * dy + dz * dz)
             last = nearest.argmax(1, keepdim=True)
@@ -45,8 +46,10 @@ def farthest_vote_peaks(votes: Float[Tensor, "batch votes 3"], order: Int[Tensor
         votes: metres.
         order: indices of the sampled votes.
     """
+    # [b, m, 3] -> [b, k, 3]
     seed = torch.take_along_dim(votes, order[..., None], dim=1)
     index = torch.arange(order.shape[1], device=votes.device)
+    # [b, k, 1, 3] - [b, 1, k, 3] -> [b, k, k]
     apart = (seed[:, :, None] - seed[:, None]).abs().amax(-1)
     repeated = ((apart == 0) & (index[None, :] < index[:, None])).any(-1)
     return Peaks(seed, 1.0 - repeated.to(votes.dtype), torch.ones_like(votes[..., 0]))

@@ -1,4 +1,4 @@
-"""From gathered votes to one feature per proposal (paper section 3.3): the three modules of Table 8.
+"""Fusion of gathered votes into one feature a proposal (paper section 3.3): the three modules of Table 8.
 
 All take the locally normalised votes ``[z; g]``, z = (vote - centre seed) / voting radius, and share the first one's
 MLP for the instance features; they differ in how the votes of a proposal become one:
@@ -44,6 +44,7 @@ class VoteBranch(nn.Module):
         index: Int[Tensor, "rows gathered"],
     ) -> Float[Tensor, "rows gathered out"]:
         """Features of the gathered votes; ``index`` are rows of ``features``."""
+        # [b * m, c] -> [r, h, c]
         out: Tensor = self.rest(self.offset(offsets) + embedding(index, self.project(features)))
         return out
 
@@ -69,6 +70,7 @@ class AttentionVoting(nn.Module):
     ) -> Float[Tensor, "rows out"]:
         """Proposal features; ``offsets`` are (vote - centre seed) / voting radius."""
         share = torch.softmax(self.weight(offsets, features, index), dim=1)
+        # [r, h, c] -> [r, c]
         return (share * self.feature(offsets, features, index)).sum(1)
 
 
@@ -98,6 +100,7 @@ class MatrixAttention(nn.Module):
     ) -> Float[Tensor, "rows out"]:
         """Proposal features; ``offsets`` are (vote - centre seed) / voting radius."""
         weight = self.weight_of_offset(offsets) + embedding(index, self.weight_of_feature(features))
+        # [r, h, c] -> [r, c]
         return (torch.softmax(weight, dim=1) * self.feature(offsets, features, index)).sum(1)
 
 
@@ -120,6 +123,7 @@ class PointNetPooling(nn.Module):
         index: Int[Tensor, "rows gathered"],
     ) -> Float[Tensor, "rows out"]:
         """Proposal features; ``offsets`` are (vote - centre seed) / voting radius."""
+        # [r, h, c] -> [r, c]
         return torch.relu(self.feature(offsets, features, index).amax(1))
 
 

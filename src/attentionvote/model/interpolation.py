@@ -17,7 +17,7 @@ _FILE = "network_ops.c"
 
 def interpolate_reference(
     coarse: Float[Tensor, "batch coarse channels"],
-    fine: Float[Tensor, "batch fine own"],
+    fine: Float[Tensor, "batch fine fine_channels"],
     nearest: Int[Tensor, "batch fine 3"],
     weights: Float[Tensor, "batch fine 3"],
 ) -> Float[Tensor, "batch fine both"]:
@@ -30,15 +30,18 @@ def interpolate_reference(
         weights: of the three, sum one.
     """
     batch, rows, channels = coarse.shape
+    # [b, fine, 3] indices within a sample -> rows of [b * coarse, c]
     index = nearest + torch.arange(batch, device=coarse.device)[:, None, None] * rows
     # One table of rows: the gradient of a lookup in it costs a third of that of an index by sample and row.
+    # [b, coarse, c] -> [b * coarse, c] -> [b, fine, 3, c]
     gathered = torch.nn.functional.embedding(index, coarse.reshape(-1, channels))
+    # [b, fine, 3, c] * [b, fine, 3, 1] -> [b, fine, c]
     return torch.cat([(gathered * weights[..., None]).sum(-2), fine], dim=-1)
 
 
 def interpolate(
     coarse: Float[Tensor, "batch coarse channels"],
-    fine: Float[Tensor, "batch fine own"],
+    fine: Float[Tensor, "batch fine fine_channels"],
     nearest: Int[Tensor, "batch fine 3"],
     weights: Float[Tensor, "batch fine 3"],
 ) -> Float[Tensor, "batch fine both"]:
@@ -55,11 +58,11 @@ class _Interpolate(torch.autograd.Function):
         coarse, fine, nearest, weights = (t.contiguous() for t in (coarse, fine, nearest, weights))
         ctx.sizes = coarse.shape[1], fine.shape[1], coarse.shape[2], fine.shape[2]
         out = coarse.new_empty(*fine.shape[:2], coarse.shape[2] + fine.shape[2])
-        given, library = [t.numpy() for t in (coarse, fine, nearest, weights)], kernels(_FILE)
+        inputs, library = [t.numpy() for t in (coarse, fine, nearest, weights)], kernels(_FILE)
         assert library is not None
 
         def work(_: int, *samples: int) -> None:
-            native.call(library.interpolate, *given, *map(native.long, samples), *ctx.sizes, out.numpy())
+            native.call(library.interpolate, *inputs, *map(native.long, samples), *ctx.sizes, out.numpy())
 
         in_threads(len(coarse), work, least=1)
         ctx.save_for_backward(nearest, weights)
@@ -68,14 +71,14 @@ class _Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         nearest, weights = ctx.saved_tensors
-        batch, (below, rows, width, own) = len(weights), ctx.sizes
-        grad_coarse, grad_fine = weights.new_empty(batch, below, width), weights.new_empty(batch, rows, own)
-        given = [t.numpy() for t in (gradients[0].contiguous(), nearest, weights)]
+        batch, (below, rows, width, fine_width) = len(weights), ctx.sizes
+        grad_coarse, grad_fine = weights.new_empty(batch, below, width), weights.new_empty(batch, rows, fine_width)
+        inputs = [t.numpy() for t in (gradients[0].contiguous(), nearest, weights)]
         out, library = [t.numpy() for t in (grad_coarse, grad_fine)], kernels(_FILE)
         assert library is not None
 
         def work(_: int, *samples: int) -> None:
-            native.call(library.interpolate_backward, *given, *map(native.long, samples), *ctx.sizes, *out)
+            native.call(library.interpolate_backward, *inputs, *map(native.long, samples), *ctx.sizes, *out)
 
         in_threads(batch, work, least=1)
         return grad_coarse, grad_fine, None, None

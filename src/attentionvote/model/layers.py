@@ -17,6 +17,7 @@ class RowNorm(nn.BatchNorm1d):
 
     def forward(self, x: Float[Tensor, "*rows channels"]) -> Float[Tensor, "*rows channels"]:
         """Normalise each channel over the rows of the batch (running statistics in evaluation)."""
+        # [..., c] -> [r, c] -> [..., c]
         return super().forward(x.reshape(-1, x.shape[-1])).view(x.shape)
 
 

@@ -1,4 +1,4 @@
-"""Which points every level of the backbone looks at; found once per sample, outside the network's gradient.
+"""Neighbourhoods of every level of the backbone, searched once a sample and outside the network's gradient.
 
 One exact farthest-point pass orders the sample; every level's centres are a prefix of it. Loader workers call
 ``find_neighborhoods`` with the C operators; the network calls it itself only when it is given none.

@@ -1,9 +1,15 @@
-"""AttentionVote: points and normals in, poses of all instances out (paper section 3, Fig. 1)."""
+"""AttentionVote: points and normals in, poses of all instances out (paper section 3, Fig. 1).
+
+Letters of the shapes in the comments of ``model`` and ``training``: b samples of the batch, n points of a sample, i its
+instances, s centres of a level, m votes (one a seed), k proposals (K), h votes gathered for a proposal (H) or
+neighbours of a centre, c channels, g members of a symmetry group, r rows (proposals of all samples, or those asked
+for).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -11,7 +17,7 @@ from torch import Tensor, nn
 
 from attentionvote.model.backbone import Backbone
 from attentionvote.model.farthest_votes import FarthestVotes, farthest_vote_peaks
-from attentionvote.model.fusion import FUSIONS, FusionKind
+from attentionvote.model.fusion import FUSIONS
 from attentionvote.model.layers import shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
 from attentionvote.model.precision import widened
@@ -24,127 +30,122 @@ from attentionvote.model.rotation import (
     quaternion_from_matrix,
     unit_quaternion,
 )
+from attentionvote.model.settings import NetworkSettings
+from attentionvote.section import read
+
+
+class PoseChannels(NamedTuple):
+    """Channels of the head's output: which of them mean what.
+
+    Attributes:
+        offset: from the centre seed to the centre, in units of 0.1 D.
+        rotation: of the parametrisation that is chosen.
+        class_logits: one a class.
+        score: see ``Poses``.
+    """
+
+    offset: slice
+    rotation: slice
+    class_logits: slice
+    score: int
+
+    @classmethod
+    def of(cls, rotation_size: int, classes: int) -> PoseChannels:
+        """The channels one after the other."""
+        first_class = 3 + rotation_size
+        return cls(slice(0, 3), slice(3, first_class), slice(first_class, first_class + classes), first_class + classes)
+
+    @property
+    def width(self) -> int:
+        """Channels in all."""
+        return self.score + 1
 
 
 class AttentionVote(nn.Module):
-    """The network. Lengths are given as fractions of the diameter D, so one preset fits parts of every size.
+    """The network.
 
     Args:
+        settings: sizes and choices, the group ``conf/model``. Of several proposals whose final centres lie within
+            ``merge_fraction`` x D (at most half of the part's smallest extent, so that stacked parts stay apart) only
+            the most confident keeps its confidence, the others get 0.
         diameter: D of the (largest) part in metres.
-        box: lowest and highest corner of the part in its own frame, metres; only the refinement looks at it.
-        centers, neighbors, widths, propagation, residual: the backbone (see ``Layout`` and ``Backbone``).
-        base_radius: r in metres; None takes ``radius_fraction`` x D. Levels have r, 2r, 3r and 6r.
-        voxel_size: of the heatmap in metres; None takes ``voxel_fraction`` x D.
-        voting_radius: radius in which votes are gathered, metres; None takes r. May be set during training.
+        box: lowest and highest corner of the part in its own frame, metres; of refinement and merging.
+
+    Attributes:
+        voting_radius: in which votes are gathered, metres; may be set during training.
         test_voting_radius: the same outside training (Table 9); None takes ``voting_radius``.
-        voting: hidden widths of the voting module.
-        vote_rotation: whether every vote also predicts its instance's rotation: dense supervision, not in the paper.
-        proposal_source: ``heatmap`` (section 3.2) or ``fps``, VoteNet's farthest-point sampling of the votes.
-        proposals: K.
-        peak_window, center_seed: see ``heatmap_peaks``.
-        gathered: H, votes gathered for a proposal.
-        fusion_kind: ``aml``, ``amx`` or ``pn`` (Table 8), see ``model.fusion``.
-        fusion: widths of the fusion's MLPs (section 3.5: 128, 128, 128).
-        head: hidden widths of the head.
-        classes: NC.
-        rotation: ``quaternion`` (the paper's) or ``six`` (Gram-Schmidt of two vectors).
-        confidence: ``exponential`` (c = exp(s), Eq. 10) or ``quality`` (c = sigmoid(s), the expected quality).
-        refinement: arguments of ``Refiner`` (points, widths, head), None for the paper's form.
-        refinement_steps: refiners in a row.
-        merge_fraction: of several proposals whose final centres lie within this share of D (at most half of the part's
-            smallest extent, so that stacked parts stay apart) only the most confident keeps its confidence, the others
-            get 0; None leaves it to the peaks alone, as in the paper.
 
     Raises:
-        ValueError: on an unknown choice, or an impossible layout.
+        ValueError: on an impossible layout.
     """
 
-    def __init__(
-        self,
-        diameter: float,
-        box: Sequence[Sequence[float]],
-        centers: Sequence[int],
-        neighbors: Sequence[int],
-        widths: Sequence[Sequence[int]],
-        propagation: Sequence[int],
-        residual: bool,
-        radius_fraction: float,
-        voxel_fraction: float,
-        voting: Sequence[int],
-        proposals: int,
-        gathered: int,
-        fusion: Sequence[int],
-        head: Sequence[int],
-        base_radius: float | None = None,
-        voxel_size: float | None = None,
-        voting_radius: float | None = None,
-        test_voting_radius: float | None = None,
-        vote_rotation: bool = False,
-        proposal_source: Literal["heatmap", "fps"] = "heatmap",
-        peak_window: int = 1,
-        center_seed: Literal["voxel", "mean"] = "voxel",
-        fusion_kind: FusionKind = "aml",
-        classes: int = 1,
-        rotation: Literal["quaternion", "six"] = "quaternion",
-        confidence: Literal["exponential", "quality"] = "exponential",
-        refinement: dict | None = None,
-        refinement_steps: int = 2,
-        merge_fraction: float | None = None,
-    ) -> None:
+    def __init__(self, settings: NetworkSettings, diameter: float, box: Sequence[Sequence[float]]) -> None:
         super().__init__()
-        for name, value, choices in (
-            ("proposal_source", proposal_source, ("heatmap", "fps")),
-            ("fusion_kind", fusion_kind, tuple(FUSIONS)),
-            ("center_seed", center_seed, ("voxel", "mean")),
-            ("rotation", rotation, ("quaternion", "six")),
-            ("confidence", confidence, ("exponential", "quality")),
-        ):
-            if value not in choices:
-                raise ValueError(f"{name} must be {' or '.join(choices)}, got {value!r}")
         self.diameter = diameter
-        radius = base_radius or radius_fraction * diameter
-        self.voxel_size = voxel_size or voxel_fraction * diameter
-        self.voting_radius = voting_radius or radius
-        self.test_voting_radius = test_voting_radius
-        self.layout = Layout(tuple(centers), tuple(neighbors), tuple(radius * k for k in (1, 2, 3, 6)))
-        self.proposals, self.gathered, self.classes = proposals, gathered, classes
-        self.peak_window, self.center_seed = peak_window, center_seed
-        self.rotation, self.confidence = rotation, confidence
-        thinnest = min(high - low for low, high in zip(*box, strict=True))
-        self.merge_radius = None if merge_fraction is None else min(merge_fraction * diameter, 0.5 * thinnest)
-        self.backbone = Backbone(self.layout, widths, propagation, residual)
+        radius = settings.base_radius or settings.radius_fraction * diameter
+        self.voxel_size = settings.voxel_size or settings.voxel_fraction * diameter
+        self.voting_radius = settings.voting_radius or radius
+        self.test_voting_radius = settings.test_voting_radius
+        radii = tuple(radius * factor for factor in (1, 2, 3, 6))
+        self.layout = Layout(tuple(settings.centers), tuple(settings.neighbors), radii)
+        self.proposals, self.gathered, self.classes = settings.proposals, settings.gathered, settings.classes
+        self.peak_window, self.center_seed = settings.peak_window, settings.center_seed
+        self.rotation, self.confidence = settings.rotation, settings.confidence
+        self.merge_radius: float | None = None
+        if settings.merge_fraction is not None:
+            thinnest = min(high - low for low, high in zip(*box, strict=True))
+            self.merge_radius = min(settings.merge_fraction * diameter, 0.5 * thinnest)
+        # The modules' order is that of the random numbers: another one would be another network for the same seed.
+        self.backbone = Backbone(self.layout, settings.widths, settings.propagation, settings.residual)
         width = self.backbone.width
-        self.vote = shared_mlp(width, voting, 3 + width)
-        rotation_size = 4 if rotation == "quaternion" else 6
-        self.vote_rotation = nn.Linear(width, rotation_size) if vote_rotation else None
+        self.vote = shared_mlp(width, settings.voting, 3 + width)
+        rotation_size = 4 if settings.rotation == "quaternion" else 6
+        self.vote_rotation = nn.Linear(width, rotation_size) if settings.vote_rotation else None
         # A module without weights: the exporter puts its own in its place.
-        self.farthest = FarthestVotes() if proposal_source == "fps" else None
+        self.farthest = FarthestVotes() if settings.proposal_source == "fps" else None
         self.heatmap = Heatmap()
-        self.fusion = FUSIONS[fusion_kind](width, fusion)
-        self.head = shared_mlp(self.fusion.width, head)
-        self.output = nn.Linear(head[-1], 3 + rotation_size + classes + 1)
+        self.fusion = FUSIONS[settings.fusion_kind](width, settings.fusion)
+        self.head = shared_mlp(self.fusion.width, settings.head)
+        self.channels = PoseChannels.of(rotation_size, settings.classes)
+        self.output = nn.Linear(settings.head[-1], self.channels.width)
         last = self.vote[-1]
         assert isinstance(last, nn.Linear)
         nn.init.normal_(last.weight, std=0.01)
-        steps = 0 if refinement is None else refinement_steps
         # A cascade: what is left to correct after one step is another, finer problem than before it.
-        self.refiners = nn.ModuleList(
-            Refiner(diameter, box, context=head[-1], **(refinement or {})) for _ in range(steps)
-        )
+        self.refiners = nn.ModuleList()
+        if settings.refinement is not None:
+            for _ in range(settings.refinement_steps):
+                self.refiners.append(Refiner(settings.refinement, diameter, box, context=settings.head[-1]))
+
+    @classmethod
+    def from_arguments(cls, arguments: Mapping[str, Any]) -> AttentionVote:
+        """The network of a flat dictionary, as checkpoints keep it: the settings, ``diameter`` and ``box``.
+
+        Raises:
+            KeyError: without ``diameter`` or ``box``.
+            SettingError: when a setting is unknown, missing, of another type or out of its range.
+            ValueError: on an impossible layout.
+        """
+        diameter, box = arguments["diameter"], arguments["box"]
+        settings = {name: value for name, value in arguments.items() if name not in ("diameter", "box")}
+        return cls(read(NetworkSettings, settings), diameter, box)
 
     def cast_votes(
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        found: Neighborhoods,
+        neighborhoods: Neighborhoods,
     ) -> Votes:
         """Seeds and their votes (section 3.1); offsets leave the network in units of half a diameter."""
-        seed_xyz, seed_feature = self.backbone(points, normals, found)
+        seed_xyz, seed_feature = self.backbone(points, normals, neighborhoods)
         residual = self.vote(seed_feature)
-        xyz = seed_xyz + residual[..., :3] * (0.5 * self.diameter)
-        feature = seed_feature + residual[..., 3:]
+        # [b, m, 3 + c] -> [b, m, 3] and [b, m, c]
+        offset, correction = residual[..., :3], residual[..., 3:]
+        xyz = seed_xyz + offset * (0.5 * self.diameter)
+        feature = seed_feature + correction
         rotation = None if self.vote_rotation is None else self._matrix(widened(self.vote_rotation(feature)))
-        return Votes(found.order[:, : self.layout.seeds], xyz, feature, rotation)
+        # [b, s of the first level] -> [b, m]: the seeds are a prefix of the farthest-point order
+        return Votes(neighborhoods.order[:, : self.layout.seeds], xyz, feature, rotation)
 
     def find_peaks(self, votes: Votes) -> Peaks:
         """The K hottest peaks of the votes' heatmap or K farthest votes (section 3.2), without gradient to them."""
@@ -162,23 +163,32 @@ class AttentionVote(nn.Module):
         Args:
             rows: flat indices into ``(batch, K)`` of the proposals wanted; all when None.
         """
-        batch, _, _ = peaks.center_seed.shape
+        batch = len(peaks.center_seed)
         radius = self.voting_radius if self.training else self.test_voting_radius or self.voting_radius
         index = gather_votes(votes.xyz.detach(), peaks.center_seed, radius, self.gathered)
+        # One table of all samples' votes: [b, k, h] indices within a sample -> [b * k, h] rows of [b * m, c]
         first_row = torch.arange(batch, device=index.device)[:, None, None] * votes.xyz.shape[1]
         index = (index + first_row).flatten(0, 1)
+        # [b, k, 3] -> [b * k, 3]
         seed = peaks.center_seed.flatten(0, 1)
         if rows is not None:
+            # [b * k, ...] -> [r, ...]
             index, seed = index[rows], seed[rows]
+        # [b, m, 3] -> [b * m, 3] -> [r, h, 3], from the seeds [r, 1, 3]
         offsets = (votes.xyz.flatten(0, 1)[index] - seed[:, None]) / self.voting_radius
+        # [b, m, c] -> [b * m, c]
         fused = self.fusion(offsets, votes.feature.flatten(0, 1), index)
         feature = self.head(fused)
         out = widened(self.output(feature))
-        center = seed + out[:, :3] * (0.1 * self.diameter)
-        raw = out[:, 3 : -1 - self.classes]
+        channels = self.channels
+        # [r, channels] -> [r, 3]
+        center = seed + out[:, channels.offset] * (0.1 * self.diameter)
+        # [r, channels] -> [r, 4 or 6]
+        raw = out[:, channels.rotation]
         rotation = self._matrix(raw)
         quaternion = unit_quaternion(raw) if self.rotation == "quaternion" else quaternion_from_matrix(rotation)
-        return Poses(center, rotation, quaternion, out[:, -1 - self.classes : -1], out[:, -1], feature)
+        # [r, channels] -> [r, classes] and [r]
+        return Poses(center, rotation, quaternion, out[:, channels.class_logits], out[:, channels.score], feature)
 
     def refine(
         self,
@@ -200,26 +210,28 @@ class AttentionVote(nn.Module):
         self,
         points: Float[Tensor, "batch points 3"],
         normals: Float[Tensor, "batch points 3"],
-        found: Neighborhoods | None = None,
+        neighborhoods: Neighborhoods | None = None,
     ) -> Predictions:
         """Poses of all instances.
 
         Args:
             points: metres, camera frame, in random order.
             normals: unit, towards the camera.
-            found: neighbourhoods when they are known already.
+            neighborhoods: of the points, when they were looked up before.
         """
-        if found is None:
-            found = find_batch(points, self.layout)
-        votes = self.cast_votes(points, normals, found)
+        if neighborhoods is None:
+            neighborhoods = find_batch(points, self.layout)
+        votes = self.cast_votes(points, normals, neighborhoods)
         peaks = self.find_peaks(votes)
         poses = self.regress(votes, peaks)
         batch, k = peaks.heat.shape
+        # [b] -> [b * k]: the sample of every row
         sample = torch.arange(batch, device=points.device).repeat_interleave(k)
         if len(self.refiners):
             poses = self.refine(points, normals, sample, poses)[-1]
 
         def shaped(rows: Tensor) -> Tensor:
+            # [b * k, ...] -> [b, k, ...]
             return rows.view(batch, k, *rows.shape[1:])
 
         return Predictions(
@@ -247,8 +259,10 @@ class AttentionVote(nn.Module):
         if self.merge_radius is None:
             return confidence
         valid = torch.where(heat > 0, confidence, torch.full_like(confidence, -1.0))
+        # [b, k, 1, 3] - [b, 1, k, 3] -> [b, k, k]: row i of a sample asks whether proposal j stands in its place
         near = (center[:, :, None] - center[:, None]).square().sum(-1) < self.merge_radius**2
         index = torch.arange(center.shape[1], device=center.device)
+        # [b, 1, k] against [b, k, 1] -> [b, k, k]
         ahead = (valid[:, None] > valid[:, :, None]) | (
             (valid[:, None] == valid[:, :, None]) & (index[None, :] < index[:, None])
         )

@@ -1,4 +1,4 @@
-"""What a centre is told about each neighbour: offset, normal, distance and point pair feature."""
+"""Features of a centre's neighbours: offset, normal, distance and point pair feature."""
 
 from __future__ import annotations
 
@@ -31,10 +31,12 @@ def pair_features_reference(
     and stay finite for a point that is its own neighbour. Offset and normal are kept beside the
     rotation-invariant PPF because the centre votes must turn with the scene.
     """
+    # [n, 3] -> [s, h, 3], from the centres [s, 1, 3]
     offset = points[index] - centers[:, None]
     normal = normals[index]
     distance = offset.norm(dim=-1, keepdim=True)
     unit = offset / (distance + TINY)
+    # [s, 3] -> [s, h, 3]
     center_normal = center_normals[:, None].expand_as(normal)
     cosines = [
         (a * b).sum(-1, keepdim=True) for a, b in ((center_normal, unit), (normal, unit), (center_normal, normal))

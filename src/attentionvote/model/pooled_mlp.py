@@ -44,9 +44,11 @@ def pooled_mlp_reference(
     """
     hidden = torch.nn.functional.linear(geometry, weights[0], weights[1])
     if projected is not None:
+        # [sources, c] -> [s, h, c]
         hidden = hidden + projected[index]
     for weight, bias in zip(weights[2::2], weights[3::2], strict=True):
         hidden = torch.nn.functional.linear(torch.relu(hidden), weight, bias)
+    # [s, h, c] -> [s, c]
     return hidden.max(dim=1)[0]
 
 

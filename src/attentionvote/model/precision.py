@@ -1,4 +1,4 @@
-"""What mixed precision must not touch: positions and rotations.
+"""Full precision for positions and rotations, which mixed precision must not touch.
 
 Autocast turns every matrix product into half precision. bfloat16 has eight significant bits: 0.8 m in front of the
 camera its steps are 4 mm, and a rotation matrix of it is a third of a degree off.

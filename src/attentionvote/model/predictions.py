@@ -1,4 +1,4 @@
-"""What the network answers, stage by stage: votes, poses of proposals, and the outputs of the exported graph."""
+"""Answers of the network, stage by stage: votes, poses of proposals, and the outputs of the exported graph."""
 
 from __future__ import annotations
 

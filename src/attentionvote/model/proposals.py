@@ -69,9 +69,11 @@ def heatmap_peaks(
     total = votes.shape[1]
     later = torch.arange(total, device=votes.device)
     at = torch.topk(torch.round(height / TIE).long() * total - later, min(count, total), dim=1)[1]
+    # [b, m] -> [b, k]
     peak_heat = torch.take_along_dim(height, at, dim=1)
     seeds = mean if center_seed == "mean" else (torch.floor(votes / voxel_size) + 0.5) * voxel_size
     batch = torch.arange(len(votes), device=votes.device)[:, None]
+    # [b, m, 3] -> [b, k, 3]
     return Peaks(seeds[batch, at], peak_heat, heat)
 
 
@@ -80,7 +82,7 @@ def heatmap_reference(
 ) -> tuple[Float[Tensor, "batch votes"], Float[Tensor, "batch votes"], Float[Tensor, "batch votes 3"]]:
     """Heat of each vote's voxel, 1 where a hotter or earlier vote is near, and the heat-weighted mean of the votes."""
     voxel = torch.floor(votes / voxel_size)
-    # Axis by axis: matrices M x M stay contiguous, which a last dimension of three would not.
+    # Axis by axis, [b, m, 1] - [b, 1, m]: matrices M x M stay contiguous, which a last dimension of three would not.
     x, y, z = (a[:, :, None] - a[:, None] for a in voxel.unbind(-1))
     # exp(-d^2 / 2) at d = 0 and +-1, and 0 beyond: exact on integers.
     gx, gy, gz = (torch.relu(1.0 - (1.0 - SIDE) * d.square()) for d in (x, y, z))
@@ -89,9 +91,11 @@ def heatmap_reference(
     near = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()) <= window
     index = torch.arange(votes.shape[1], device=votes.device)
     # Equal voxels have equal heat only up to the order of summation; the tolerance restores the tie.
+    # [b, 1, m] - [b, m, 1] -> [b, m, m]
     ahead = heat[:, None] - heat[:, :, None]
     earlier = index[None, :] < index[:, None]
     beaten = near & ((ahead > TIE) | ((ahead.abs() <= TIE) & earlier))
+    # [b, m, m] @ [b, m, 3] / [b, m, 1] -> [b, m, 3]
     return heat, beaten.to(heat.dtype).amax(-1), weight @ votes / heat[..., None]
 
 
@@ -107,11 +111,11 @@ class Heatmap(nn.Module):
             return heatmap_reference(votes, voxel_size, window)
         batch, count, _ = votes.shape
         heat, beaten, mean = torch.empty(batch, count), torch.empty(batch, count), torch.empty(batch, count, 3)
-        given, out = votes.detach().contiguous().numpy(), [t.numpy() for t in (heat, beaten, mean)]
+        inputs, out = votes.detach().contiguous().numpy(), [t.numpy() for t in (heat, beaten, mean)]
         settings = float(voxel_size), window, CENTER, SIDE, TIE
 
         def work(_: int, *samples: int) -> None:
-            native.call(library.heatmap, given, *map(native.long, samples), count, *settings, *out)
+            native.call(library.heatmap, inputs, *map(native.long, samples), count, *settings, *out)
 
         in_threads(batch, work, least=1)
         return heat, beaten, mean
@@ -129,16 +133,18 @@ def gather_votes_reference(
     Votes come in farthest-point order of their seeds, so the first ones are spread over the visible surface. The
     paper draws at random with repetition; this choice is deterministic and needs no other form at export.
     """
+    # [b, k, 1, 3] - [b, 1, m, 3] -> [b, k, m]
     squared = (center_seed[:, :, None] - votes[:, None]).square().sum(-1)
     total = votes.shape[1]
     order = torch.arange(total, 0, -1, device=votes.device, dtype=votes.dtype)
     inside = squared <= radius * radius
     nearest = squared.argmin(-1)
     rank, index = torch.topk(torch.where(inside, order, -squared), min(count, total), dim=-1)
-    found = (rank > 0).sum(-1, keepdim=True)
-    position = torch.arange(count, device=votes.device) % found.clamp(min=1)
+    inside_count = (rank > 0).sum(-1, keepdim=True)
+    # [b, k, min(count, m)] -> [b, k, count]
+    position = torch.arange(count, device=votes.device) % inside_count.clamp(min=1)
     index = torch.take_along_dim(index, position, dim=-1)
-    return torch.where(found > 0, index, nearest[..., None])
+    return torch.where(inside_count > 0, index, nearest[..., None])
 
 
 def gather_votes(
@@ -153,11 +159,11 @@ def gather_votes(
         return gather_votes_reference(votes, center_seed, radius, count)
     batch, total, _ = votes.shape
     out = torch.empty(batch, center_seed.shape[1], count, dtype=torch.long)
-    given = [t.detach().contiguous().numpy() for t in (votes, center_seed)]
+    inputs = [t.detach().contiguous().numpy() for t in (votes, center_seed)]
     settings = total, center_seed.shape[1], radius * radius, count
 
     def work(_: int, *samples: int) -> None:
-        native.call(library.votes_around, *given, *map(native.long, samples), *settings, out.numpy())
+        native.call(library.votes_around, *inputs, *map(native.long, samples), *settings, out.numpy())
 
     in_threads(batch, work, least=1)
     return out

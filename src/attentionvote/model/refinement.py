@@ -25,6 +25,7 @@ from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_weights
 from attentionvote.model.precision import full_precision, widened
 from attentionvote.model.rotation import matrix_from_six
 from attentionvote.model.row_threads import in_threads
+from attentionvote.model.settings import RefinementSettings
 
 CHANNELS = 6
 
@@ -57,15 +58,18 @@ def points_in_box_reference(
         scale: multiplies the positions (1 / D: order one).
         count: points a row; fewer are repeated in turn, none gives zeros.
     """
+    # [b, n, 3] -> [r, n, 3], from the centres [r, 1, 3]
     local = (points[sample] - center[:, None]) @ rotation
     turned = normals[sample] @ rotation
     inside = ((local >= box[0]) & (local <= box[1])).all(-1)
     order = torch.arange(points.shape[1], 0, -1, device=points.device, dtype=points.dtype)
     rank, index = torch.topk(torch.where(inside, order, torch.zeros_like(order)), min(count, points.shape[1]), dim=1)
-    found = (rank > 0).sum(1, keepdim=True)
-    index = torch.take_along_dim(index, torch.arange(count, device=points.device) % found.clamp(min=1), dim=1)
+    inside_count = (rank > 0).sum(1, keepdim=True)
+    # [r, min(count, n)] -> [r, count]
+    index = torch.take_along_dim(index, torch.arange(count, device=points.device) % inside_count.clamp(min=1), dim=1)
+    # [r, n, 6] -> [r, count, 6]
     picked = torch.take_along_dim(torch.cat([local * scale, turned], -1), index[..., None], dim=1)
-    return picked * (found > 0).to(picked.dtype)[..., None]
+    return picked * (inside_count > 0).to(picked.dtype)[..., None]
 
 
 def points_in_box(
@@ -100,34 +104,27 @@ class Refiner(nn.Module):
     """Corrects poses by looking at the measured points from the predicted pose.
 
     Args:
+        settings: how many points around a pose are looked at, the shared MLP over them, whose maximum describes what is
+            left to correct, and the MLP after the maximum.
         diameter: D in metres.
         box: lowest and highest corner of the part in its own frame, metres.
-        points: points looked at per proposal.
-        widths: shared MLP over the points; its maximum is the description of what is left to correct.
-        head: MLP after the maximum.
         context: channels of the proposal's own feature, appended to the maximum.
     """
 
     def __init__(
-        self,
-        diameter: float,
-        box: Sequence[Sequence[float]],
-        points: int,
-        widths: Sequence[int],
-        head: Sequence[int],
-        context: int,
+        self, settings: RefinementSettings, diameter: float, box: Sequence[Sequence[float]], context: int
     ) -> None:
         super().__init__()
-        self.diameter, self.points = diameter, points
+        self.diameter, self.points = diameter, settings.points
         self.scale = 2.0 / diameter  # positions looked at are of order one
         margin = 0.06 * diameter
         corners = torch.tensor(box, dtype=torch.float32) + torch.tensor([[-margin], [margin]])
         self.box: Tensor
         self.register_buffer("box", corners)
-        self.weights = pooled_mlp_weights(CHANNELS, widths)
-        self.norm = RowNorm(widths[-1])
-        self.mlp = shared_mlp(widths[-1] + context, head)
-        self.output = nn.Linear(head[-1], 10)
+        self.weights = pooled_mlp_weights(CHANNELS, settings.widths)
+        self.norm = RowNorm(settings.widths[-1])
+        self.mlp = shared_mlp(settings.widths[-1] + context, settings.head)
+        self.output = nn.Linear(settings.head[-1], 10)
         nn.init.normal_(self.output.weight, std=1e-3)
         nn.init.zeros_(self.output.bias)
 
@@ -157,8 +154,11 @@ class Refiner(nn.Module):
         """The corrected poses, given the maximum over the points that were looked at."""
         pooled = torch.relu(self.norm(pooled))
         out = widened(self.output(self.mlp(torch.cat([pooled, context], dim=-1))))
+        # [r, 10] -> [r, 3], [r, 6] and [r]
+        offset, six, score = out[:, :3], out[:, 3:9], out[:, 9]
         identity = torch.tensor([1.0, 0, 0, 0, 1.0, 0], device=out.device)
         with full_precision(center.device):
-            shift = (rotation @ out[:, :3, None])[..., 0] * (0.1 * self.diameter)
-            turn = matrix_from_six(identity + 0.3 * out[:, 3:9])
-            return Refined(center + shift, rotation @ turn, out[:, 9])
+            # [r, 3, 3] @ [r, 3, 1] -> [r, 3]
+            shift = (rotation @ offset[:, :, None])[..., 0] * (0.1 * self.diameter)
+            turn = matrix_from_six(identity + 0.3 * six)
+            return Refined(center + shift, rotation @ turn, score)

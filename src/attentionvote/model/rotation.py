@@ -19,6 +19,7 @@ def matrix_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tenso
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
+    # nine of [...] -> [..., 3, 3]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
@@ -29,10 +30,12 @@ def unit_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*ba
 
 def matrix_from_six(six: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of two 3-vectors by Gram-Schmidt (Zhou et al. 2019): continuous, so easier to learn."""
+    # [..., 6] -> two of [..., 3]
     a, b = six[..., :3], six[..., 3:]
     x = a / (a.square().sum(-1, keepdim=True) + _TINY).sqrt()
     b = b - (x * b).sum(-1, keepdim=True) * x
     y = b / (b.square().sum(-1, keepdim=True) + _TINY).sqrt()
+    # three columns [..., 3] -> [..., 3, 3]
     return torch.stack([x, y, torch.linalg.cross(x, y, dim=-1)], dim=-1)
 
 
@@ -52,6 +55,7 @@ def quaternion_from_matrix(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tenso
         dim=-2,
     )
     largest = torch.diagonal(candidates, dim1=-2, dim2=-1).argmax(-1)
+    # [..., 4, 4] -> [..., 4]: the row with the largest divisor
     q = torch.take_along_dim(candidates, largest[..., None, None], dim=-2)[..., 0, :]
     q = unit_quaternion(q)
     return torch.where(q[..., :1] < 0, -q, q)

@@ -64,10 +64,10 @@ class Gate:
     name: str
     holds: bool
     demands: str
-    found: str
+    finding: str
 
     def __str__(self) -> str:
-        return f"{'holds' if self.holds else 'FAILS'}: {self.demands}; {self.found}"
+        return f"{'holds' if self.holds else 'FAILS'}: {self.demands}; {self.finding}"
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,14 @@ class Origin:
     """What the tracking store knows of the training that made a model.
 
     Attributes:
-        found: whether it has the run that the card names.
+        has_run: whether it has the run that the card names.
         has_config: whether the run holds its resolved configuration.
         commits: what the run was made with, session by session, as a card names it.
         has_changes: whether it holds, whole, the changes of every session whose commit was not clean.
         signed_by: fingerprint of the key whose signature was verified.
     """
 
-    found: bool
+    has_run: bool
     has_config: bool = False
     commits: tuple[str, ...] = ()
     has_changes: bool = False
@@ -132,11 +132,11 @@ def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
         if value is None:
             yield Gate(f"floor {name}", False, demands, "it was not measured")
             continue
-        found = f"{value:.4f}"
+        finding = f"{value:.4f}"
         if name in candidate.draws:
             sure = interval(candidate.draws[name])
-            found += f" ({sure.low:.3f} to {sure.high:.3f})"
-        yield Gate(f"floor {name}", value >= floor, demands, found)
+            finding += f" ({sure.low:.3f} to {sure.high:.3f})"
+        yield Gate(f"floor {name}", value >= floor, demands, finding)
 
 
 def _not_worse(margins: Mapping[str, float], candidate: Evidence, champion: Evidence) -> Iterator[Gate]:
@@ -149,8 +149,8 @@ def _not_worse(margins: Mapping[str, float], candidate: Evidence, champion: Evid
             continue
         difference = candidate.figures[name] - champion.figures[name]
         sure = interval(candidate.draws[name] - champion.draws[name])
-        found = f"{champion.figures[name]:.4f} {difference:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
-        yield Gate(f"champion {name}", sure.low >= -margin, demands, found)
+        finding = f"{champion.figures[name]:.4f} {difference:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
+        yield Gate(f"champion {name}", sure.low >= -margin, demands, finding)
 
 
 def _latency(budget_ms: float, candidate: Evidence) -> Gate:
@@ -163,7 +163,7 @@ def _parity(card: ModelCard, limits: Limits) -> Gate:
     paths: Any = card.parity.get("paths")
     if not isinstance(paths, Mapping) or not paths:
         return Gate("parity", False, demands, "the card holds no proof: export the model again")
-    found = []
+    finding = []
     for path, content in paths.items():
         try:
             parity = Parity.from_dict(content)
@@ -172,8 +172,8 @@ def _parity(card: ModelCard, limits: Limits) -> Gate:
         broken = parity.violations(limits)
         if broken:
             return Gate("parity", False, demands, f"{path}: {broken[0]}")
-        found.append(f"{path} {parity.translation_mm:.4f} mm, {parity.rotation_degrees:.4f} degrees")
-    return Gate("parity", True, demands, "; ".join(found))
+        finding.append(f"{path} {parity.translation_mm:.4f} mm, {parity.rotation_degrees:.4f} degrees")
+    return Gate("parity", True, demands, "; ".join(finding))
 
 
 def _provenance(card: ModelCard, origin: Origin) -> Iterator[Gate]:
@@ -182,9 +182,9 @@ def _provenance(card: ModelCard, origin: Origin) -> Iterator[Gate]:
     digests = ", ".join(f"{split} {digest[:8]}" for split, digest in card.data.items())
     yield Gate("data", not missing, "digests of all scene sets", digests if not missing else f"no {missing[0]} digest")
     where = f"run {card.run_id[:8]}" if card.run_id else "the card names no run"
-    known_config = origin.found and origin.has_config
-    problem = "" if known_config else (" has no config.yaml" if origin.found else " is not in the store")
-    yield Gate("config", known_config, "the run's resolved configuration", where + problem * bool(card.run_id))
+    has_config = origin.has_run and origin.has_config
+    problem = "" if has_config else (" has no config.yaml" if origin.has_run else " is not in the store")
+    yield Gate("config", has_config, "the run's resolved configuration", where + problem * bool(card.run_id))
     lacking = [name for name in ("attentionvote", "torch", "onnx", "onnxruntime") if name not in card.versions]
     versions = ", ".join(f"{name} {card.versions[name]}" for name in ("torch", "onnxruntime") if name in card.versions)
     yield Gate("versions", not lacking, "versions of what made it", f"no {lacking[0]}" if lacking else versions)
@@ -192,18 +192,18 @@ def _provenance(card: ModelCard, origin: Origin) -> Iterator[Gate]:
     yield Gate("signature", bool(origin.signed_by), "the signature of the trusted key", signed)
 
 
-def _commit(said: str, origin: Origin) -> Gate:
+def _commit(card_commit: str, origin: Origin) -> Gate:
     demands = "the commit that its run names, clean or with its changes recorded"
-    known = [len(name) == 40 and set(name) <= set("0123456789abcdef") for name, _ in map(_split, origin.commits)]
-    if not origin.commits or not all(known):
-        return Gate("commit", False, demands, f"the card says {said or 'none'}, the run names none")
-    if said != origin.commits[-1]:
-        return Gate("commit", False, demands, f"the card says {said or 'none'}, the run {origin.commits[-1]}")
+    well_formed = [len(name) == 40 and set(name) <= set("0123456789abcdef") for name, _ in map(_split, origin.commits)]
+    if not origin.commits or not all(well_formed):
+        return Gate("commit", False, demands, f"the card says {card_commit or 'none'}, the run names none")
+    if card_commit != origin.commits[-1]:
+        return Gate("commit", False, demands, f"the card says {card_commit or 'none'}, the run {origin.commits[-1]}")
     dirty = any(changes for _, changes in map(_split, origin.commits))
-    found = " then ".join(dict.fromkeys(_split(commit)[0][:12] for commit in origin.commits))
+    finding = " then ".join(dict.fromkeys(_split(commit)[0][:12] for commit in origin.commits))
     if dirty:
-        found += f" with changes that are {'recorded' if origin.has_changes else 'not recorded whole'}"
-    return Gate("commit", not dirty or origin.has_changes, demands, found)
+        finding += f" with changes that are {'recorded' if origin.has_changes else 'not recorded whole'}"
+    return Gate("commit", not dirty or origin.has_changes, demands, finding)
 
 
 def _split(commit: str) -> tuple[str, bool]:

@@ -54,7 +54,7 @@ def stand(versions: Versions, history: History, carry_out: bool = True) -> Stand
     unfinished = bool(moves) and not moves[-1].done
     if unfinished and carry_out:
         if moves[-1].version in existing:
-            log.warning("the %s was decided but not carried out: the champion is moved now", told(moves[-1]))
+            log.warning("the %s was decided but not carried out: the champion is moved now", phrase(moves[-1]))
             _carry_out(versions, history, existing)
         history.mark_done(moves[-1])
     champion = versions.champion()
@@ -75,7 +75,9 @@ def stand(versions: Versions, history: History, carry_out: bool = True) -> Stand
         got = "there is none (was the version deleted?)" if now is None else f"it is version {now}"
         astray = f"the champion must be version {moves[-1].version} by the history, but {got}: it was changed by hand"
         if unfinished and not carry_out:
-            astray = f"the {told(moves[-1])} was decided but not carried out: `make promote` or `make rollback` does it"
+            astray = (
+                f"the {phrase(moves[-1])} was decided but not carried out: `make promote` or `make rollback` does it"
+            )
     return Standing(
         champion,
         moves[-1].number if moves else 0,
@@ -106,11 +108,11 @@ def move(
     if event.mark not in [other.mark for other in moves]:
         winner = next(other for other in moves if other.base == standing.base)
         raise Superseded(
-            f"the champion of {versions.part} must stay the same during a {kind}, but the {told(winner)} came first: "
+            f"the champion of {versions.part} must stay the same during a {kind}, but the {phrase(winner)} came first: "
             "run the same command again to decide against the new champion"
         )
     event = next(other for other in moves if other.mark == event.mark)
-    _carry_out(versions, history, {known.number: known for known in versions.all()})
+    _carry_out(versions, history, {version.number: version for version in versions.all()})
     history.mark_done(event)
     return event
 
@@ -147,7 +149,7 @@ def target(versions: Versions, standing: Standing, wanted: int | None) -> Versio
     raise ValueError(f"a rollback of {versions.part} must be to a former champion ({have}), got {wanted}, {problem}")
 
 
-def told(event: Event) -> str:
+def phrase(event: Event) -> str:
     """An event in a few words."""
     when = strftime("%Y-%m-%d %H:%M", localtime(event.when_s))
     return f"{event.kind} of version {event.version} by {event.who} at {when}"

@@ -72,13 +72,13 @@ class Versions:
 
     def all(self) -> list[Version]:
         """Every version that exists, oldest first; empty when nothing was ever registered."""
-        found, token = [], None
+        listed, token = [], None
         while True:
             page = self.client.search_model_versions(f"name='{self.name}'", max_results=200, page_token=token)
-            found += [_version(row) for row in page]
+            listed += [_version(row) for row in page]
             token = page.token
             if not token:
-                return sorted(found, key=lambda version: version.number)
+                return sorted(listed, key=lambda version: version.number)
 
     def champion(self) -> Version | None:
         """The version that cells follow; None before the first promotion, or when it was deleted."""
@@ -101,13 +101,13 @@ class Versions:
         Raises:
             OSError: when what the store gives back is not what it got.
         """
-        known = self.of_bundle(bundle.digest)
-        if known is not None and self._is_whole(known):
-            for name in known.tags:
+        registered = self.of_bundle(bundle.digest)
+        if registered is not None and self._is_whole(registered):
+            for name in registered.tags:
                 if name.startswith("gate.") and name not in tags:  # of an earlier decision
-                    self.client.delete_model_version_tag(self.name, str(known.number), name)
-            self.tag(known, tags)
-            return known
+                    self.client.delete_model_version_tag(self.name, str(registered.number), name)
+            self.tag(registered, tags)
+            return registered
         run = self._run(bundle.card.run_id)
         experiment = run.info.experiment_id if run else experiment_id(self.client, self.uri, self.part)
         run_id = run.info.run_id if run else None

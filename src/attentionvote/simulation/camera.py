@@ -25,8 +25,8 @@ class Camera:
     height: Annotated[int, Setting("Pixels.", low=8, high=16384)] = 772
     fx: Annotated[float, Setting("Focal length, pixels.", above=0, high=1e6)] = 1700.0
     fy: Annotated[float, Setting("Focal length, pixels.", above=0, high=1e6)] = 1700.0
-    cx: Annotated[float, Setting("Principal point, pixels.", low=-1e6, high=1e6)] = 516.0
-    cy: Annotated[float, Setting("Principal point, pixels.", low=-1e6, high=1e6)] = 386.0
+    cx: Annotated[float, Setting("Principal point, pixels.", low=0, high=1e6)] = 516.0
+    cy: Annotated[float, Setting("Principal point, pixels.", low=0, high=1e6)] = 386.0
 
     def __post_init__(self) -> None:
         check(self)

@@ -50,21 +50,21 @@ def simulate_cycle(
         scene_rng = np.random.default_rng(seeds[count])
         camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
         camera_from_part = camera_from_bin @ pile.bin_from_part
-        surface, own_ids = BinSurface(bin_size, camera_from_bin), part_ids[:count]
+        surface, dropped_ids = BinSurface(bin_size, camera_from_bin), part_ids[:count]
         records.append(
             SceneRecord(
                 cycle=cycle,
                 drop_count=count,
                 camera_from_part=camera_from_part,
                 visible_fraction=caster.visible_fraction(
-                    camera_from_part, spec.camera.camera, surface, spec.visibility_stride, own_ids
+                    camera_from_part, spec.camera.camera, surface, spec.visibility_stride, dropped_ids
                 ),
                 camera=spec.camera.camera,
                 camera_from_bin=camera_from_bin,
                 bin_size=bin_size,
                 friction=friction,
                 scene_seed=int(scene_rng.integers(2**63)),
-                part_ids=own_ids,
+                part_ids=dropped_ids,
             )
         )
     return records
@@ -72,4 +72,6 @@ def simulate_cycle(
 
 def solids_of(part: Parts, settings: DropSettings) -> list[Solid]:
     """The parts with their convex pieces."""
-    return [Solid(one, convex_hulls(one, settings.hull_threshold, settings.hull_vertices)) for one in part.parts]
+    return [
+        Solid(member, convex_hulls(member, settings.hull_threshold, settings.hull_vertices)) for member in part.parts
+    ]

@@ -84,14 +84,14 @@ def drop_parts(
         bin_from_part = transform(matrix_from_quaternion(pose[:, 3:]), pose[:, :3])
         pile_top = 0.0
         for i, (_, centre, _) in enumerate(masses):
-            own = bin_from_part[part_ids[: k + 1] == i]
-            if not len(own):
+            poses_of_part = bin_from_part[part_ids[: k + 1] == i]
+            if not len(poses_of_part):
                 continue
-            centres = apply(own, centre[None])[:, 0]
+            centres = apply(poses_of_part, centre[None])[:, 0]
             outside = np.abs(centres[:, :2]) > half
             if outside.any() or (centres[:, 2] < 0).any() or (centres[:, 2] > bin_size[2]).any():
                 return
-            pile_top = max(pile_top, float(apply(own, vertices[i])[..., 2].max()))
+            pile_top = max(pile_top, float(apply(poses_of_part, vertices[i])[..., 2].max()))
         if speed <= 0.05:
             yield Pile(bin_from_part, speed)
 
@@ -113,8 +113,8 @@ def _release(
     # Between the walls with its whole extent, in the middle where it is too long for that.
     first, last = -half - low[:2], half - high[:2]
     middle = (first + last) / 2
-    place = rng.uniform(np.minimum(first, middle), np.maximum(last, middle))
-    data.qpos[7 * k : 7 * k + 7] = [*place, height - low[2], *quaternion]
+    center = rng.uniform(np.minimum(first, middle), np.maximum(last, middle))
+    data.qpos[7 * k : 7 * k + 7] = [*center, height - low[2], *quaternion]
     data.qvel[6 * k : 6 * k + 6] = [0, 0, -speed, 0, 0, 0]
     model.body_gravcomp[k + 1] = 0.0  # body 0 is the world
 

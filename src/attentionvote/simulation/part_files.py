@@ -84,8 +84,8 @@ def load_parts(
         FileNotFoundError: as ``load_part``.
     """
     if not isinstance(parts, Mapping) or len(parts) < 2:
-        given = ", ".join(map(str, parts)) if isinstance(parts, Mapping) else repr(parts)
-        raise ValueError(f"{name}: parts must be at least two parts by name, got {given or 'none'}")
+        listed = ", ".join(map(str, parts)) if isinstance(parts, Mapping) else repr(parts)
+        raise ValueError(f"{name}: parts must be at least two parts by name, got {listed or 'none'}")
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size)):
         if value is not None and not 0 < value < 10:
             raise ValueError(f"{name}: {key} must be positive metres (below 10) or null, got {value}")
@@ -106,8 +106,8 @@ def _member(name: str, key: str, settings: Part | Mapping[str, Any]) -> Part:
 def _symmetry(name: str, symmetry: Mapping[str, Any] | Symmetry | None) -> Symmetry | None:
     if symmetry is None or isinstance(symmetry, Symmetry):
         return symmetry
-    known = set(Symmetry.__dataclass_fields__)
-    unknown = sorted(set(symmetry) - known)
+    keys = set(Symmetry.__dataclass_fields__)
+    unknown = sorted(set(symmetry) - keys)
     if unknown:
-        raise ValueError(f"{name}: symmetry must only have the keys {', '.join(sorted(known))}, got '{unknown[0]}'")
+        raise ValueError(f"{name}: symmetry must only have the keys {', '.join(sorted(keys))}, got '{unknown[0]}'")
     return Symmetry(**dict(symmetry))

@@ -1,4 +1,4 @@
-"""Which rays are cast: pixels in random order, of their rays those that can meet an instance first.
+"""Selection of the rays that are cast: pixels in random order, of their rays those that can meet an instance first.
 
 Nothing that is left out could change a hit: the results are those of all rays at all instances, to the bit.
 """
@@ -41,17 +41,20 @@ class Windows(NamedTuple):
         flat, plane = (count,), (count, 2)
         return cls(*(np.empty(shape) for shape in (plane, plane, plane, flat, flat, flat)))
 
-    def fill(self, own: NDArray[np.bool_], outline: Floats) -> None:
-        """Set the windows of the instances ``own`` ``(I,)`` from their ``outline`` ``(O, V, 3)``, camera frame."""
+    def fill(self, instances: NDArray[np.bool_], outline: Floats) -> None:
+        """Set the windows of the ``instances`` ``(I,)`` from their ``outline`` ``(O, V, 3)``, camera frame."""
         projected = outline[..., :2] / outline[..., 2:]
-        self.low[own], self.high[own] = projected.min(axis=1) - 1e-9, projected.max(axis=1) + 1e-9
+        self.low[instances], self.high[instances] = projected.min(axis=1) - 1e-9, projected.max(axis=1) + 1e-9
         x, y = np.moveaxis(projected - projected.mean(axis=1, keepdims=True), -1, 0)
         along = np.arctan2(2 * (x * y).sum(axis=1), (x * x).sum(axis=1) - (y * y).sum(axis=1)) / 2
         across = np.stack([-np.sin(along), np.cos(along)], axis=1)
         coordinate = (projected @ across[:, :, None])[..., 0]
-        self.across[own] = across
-        self.low_across[own], self.high_across[own] = coordinate.min(axis=1) - _BESIDE, coordinate.max(axis=1) + _BESIDE
-        self.near[own] = outline[..., 2].min(axis=1) * (1 - _NEARER)
+        self.across[instances] = across
+        self.low_across[instances], self.high_across[instances] = (
+            coordinate.min(axis=1) - _BESIDE,
+            coordinate.max(axis=1) + _BESIDE,
+        )
+        self.near[instances] = outline[..., 2].min(axis=1) * (1 - _NEARER)
 
 
 class NearestHits:
@@ -68,20 +71,20 @@ class NearestHits:
         self.face = np.zeros(count, dtype=np.int32)
         self._library = native.load("attentionvote.simulation", "rays.c")
 
-    def keep(self, chosen: NDArray, depth: NDArray[np.float32], face: NDArray[np.int32], instance: int) -> None:
-        """Take over hits of the rays ``chosen`` ``(C,)`` on an instance, face -1 for none, where they are the nearest.
+    def keep(self, ray_ids: NDArray, depth: NDArray[np.float32], face: NDArray[np.int32], instance: int) -> None:
+        """Take over hits of the rays ``ray_ids`` ``(C,)`` on an instance, face -1 for none, where they are the nearest.
 
         Of equally near instances the one with the lowest index stays, whatever the order of the calls.
         """
         if self._library is not None:
-            rays, hit = (np.ascontiguousarray(a, dtype=np.int32) for a in (chosen, face))
+            rays, hit = (np.ascontiguousarray(a, dtype=np.int32) for a in (ray_ids, face))
             into = self.nearest, self.owner, self.face
             native.call(self._library.keep_nearer, rays, len(rays), depth, hit, int(instance), *into)
             return
-        before = self.nearest[chosen]
-        nearer = (face >= 0) & ((depth < before) | ((depth == before) & (instance < self.owner[chosen])))
-        chosen = chosen[nearer]
-        self.nearest[chosen], self.owner[chosen], self.face[chosen] = depth[nearer], instance, face[nearer]
+        before = self.nearest[ray_ids]
+        nearer = (face >= 0) & ((depth < before) | ((depth == before) & (instance < self.owner[ray_ids])))
+        ray_ids = ray_ids[nearer]
+        self.nearest[ray_ids], self.owner[ray_ids], self.face[ray_ids] = depth[nearer], instance, face[nearer]
 
 
 class FirstHits(NearestHits):
@@ -96,7 +99,7 @@ class FirstHits(NearestHits):
         # Sorted by x, the rays that can meet an instance are a slice, then comparisons.
         self.order = np.argsort(xy[:, 0])
         self._x, self._y = xy[self.order, 0], xy[self.order, 1]
-        self._chosen = np.empty(len(xy) + 1, dtype=np.int32)
+        self._ray_ids = np.empty(len(xy) + 1, dtype=np.int32)
         self._rays = np.empty((len(xy) + 1, 3), dtype=np.float32)
 
     def slices(self, windows: Windows) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -114,15 +117,15 @@ class FirstHits(NearestHits):
         low, high, across = windows.low[i, 1], windows.high[i, 1], windows.across[i]
         if self._library is None:
             inside = self._y[first:last]
-            chosen = np.flatnonzero((inside >= low) & (inside <= high)) + first
-            rays = np.ones((len(chosen), 3), dtype=np.float32)
-            rays[:, 0], rays[:, 1] = self._x[chosen], self._y[chosen]
-            return chosen, rays
+            ray_ids = np.flatnonzero((inside >= low) & (inside <= high)) + first
+            rays = np.ones((len(ray_ids), 3), dtype=np.float32)
+            rays[:, 0], rays[:, 1] = self._x[ray_ids], self._y[ray_ids]
+            return ray_ids, rays
         window = np.array([low, high, *across, windows.low_across[i], windows.high_across[i], windows.near[i]])
         count = np.zeros(1, dtype=np.int32)
-        found = window, self._chosen, self._rays, count
-        native.call(self._library.select_rays, self._x, self._y, self.nearest, int(first), int(last), *found)
-        return self._chosen[: count[0]], self._rays[: count[0]]
+        results = window, self._ray_ids, self._rays, count
+        native.call(self._library.select_rays, self._x, self._y, self.nearest, int(first), int(last), *results)
+        return self._ray_ids[: count[0]], self._rays[: count[0]]
 
 
 def random_order(count: int, rng: np.random.Generator) -> NDArray[np.int32]:

@@ -99,19 +99,19 @@ class PartCaster:
         self.part = part
         self._surfaces: list[_Surface] = []
         normals = []
-        for one in part.parts:
-            triangles = one.vertices[one.faces]
+        for member in part.parts:
+            triangles = member.vertices[member.faces]
             normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
             length = np.linalg.norm(normal, axis=1, keepdims=True)
             normals.append(normal / np.where(length > 0, length, 1.0))
             scene = EmbreeScene()
             mesh = TriangleMesh(scene, triangles.astype(np.float32))
-            outline = one.vertices[ConvexHull(one.vertices).vertices]
+            outline = member.vertices[ConvexHull(member.vertices).vertices]
             self._surfaces.append(_Surface(outline, scene, mesh))
         self._normals = np.concatenate(normals)
         self._first_face = np.cumsum([0, *(len(normal) for normal in normals[:-1])])
         # Parts rest a fraction of a millimetre inside floor and walls: such points still belong to the part.
-        self._sunk = np.array([0.005 * one.diameter for one in part.parts])
+        self._sunk = np.array([0.005 * member.diameter for member in part.parts])
 
     def cast(
         self,
@@ -141,8 +141,8 @@ class PartCaster:
         # What lies nearer hides rays from the rest.
         part_from_camera = inverse(camera_from_part)
         for i in np.argsort(windows.near, kind="stable"):
-            chosen, rays = hits.select(windows, i, first[i], last[i])
-            hits.keep(chosen, *self._cast_one(kinds[i], part_from_camera[i], rays), i)
+            ray_ids, rays = hits.select(windows, i, first[i], last[i])
+            hits.keep(ray_ids, *self._cast_instance(kinds[i], part_from_camera[i], rays), i)
         depth, instance = np.full(len(xy), np.inf), np.full(len(xy), -1, dtype=np.int32)
         normal = np.zeros((len(xy), 3))
         hit = np.flatnonzero(hits.owner >= 0)
@@ -212,21 +212,21 @@ class PartCaster:
             meets = (across >= windows.low_across[i]) & (across <= windows.high_across[i])
             if np.count_nonzero(meets) < 2:  # one ray is turned by another routine than many, with another rounding
                 meets[:] = True
-            chosen = np.flatnonzero(meets)
-            v = chosen // max(len(x), 1)
-            u = chosen - v * len(x)
+            cells = np.flatnonzero(meets)
+            v = cells // max(len(x), 1)
+            u = cells - v * len(x)
             rays = np.ones((len(u), 3), dtype=np.float32)
             rays[:, 0], rays[:, 1] = x[u], y[v]
-            depth, face = self._cast_one(kinds[i], part_from_camera, rays)
+            depth, face = self._cast_instance(kinds[i], part_from_camera, rays)
             silhouette[i] = np.count_nonzero(face >= 0)
             pixel = (row[v] - origin[1]) * buffer_size[0] + (column[u] - origin[0])
             hits.keep(pixel, depth, face, i)
-        found = np.flatnonzero(hits.owner >= 0)
-        owner, row = hits.owner[found], found // buffer_size[0]
-        pixels = (np.stack([found - row * buffer_size[0], row], axis=1) + origin) * stride
+        hit_pixels = np.flatnonzero(hits.owner >= 0)
+        owner, row = hits.owner[hit_pixels], hit_pixels // buffer_size[0]
+        pixels = (np.stack([hit_pixels - row * buffer_size[0], row], axis=1) + origin) * stride
         seen = ((pixels >= 0) & (pixels < size)).all(axis=1)
         if surface is not None:
-            seen &= hits.nearest[found] < surface.depth(camera.rays(pixels)) + self._sunk[kinds[owner]]
+            seen &= hits.nearest[hit_pixels] < surface.depth(camera.rays(pixels)) + self._sunk[kinds[owner]]
         visible = np.bincount(owner[seen], minlength=count)
         return visible / np.maximum(silhouette, 1)
 
@@ -246,16 +246,16 @@ class PartCaster:
         """Where the instances are on the plane z = 1."""
         windows = Windows.empty(len(kinds))
         for kind, part in enumerate(self.part.parts):
-            own = kinds == kind
-            if not own.any():
+            of_kind = kinds == kind
+            if not of_kind.any():
                 continue
-            outline = apply(camera_from_part[own], self._surfaces[kind].outline)
+            outline = apply(camera_from_part[of_kind], self._surfaces[kind].outline)
             if outline[..., 2].min() <= 0:
                 raise ValueError(f"{part.name}: every instance must lie in front of the camera, one reaches z <= 0")
-            windows.fill(own, outline)
+            windows.fill(of_kind, outline)
         return windows
 
-    def _cast_one(
+    def _cast_instance(
         self, kind: int, part_from_camera: Floats, rays: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays ``(P, 3)`` (x, y, 1) at one instance alone."""

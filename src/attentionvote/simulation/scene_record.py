@@ -1,4 +1,4 @@
-"""What is stored of a scene: poses, visibility and camera, under a kilobyte; the points are ray-cast when needed."""
+"""Stored form of a scene: poses, visibility and camera, under a kilobyte; the points are ray-cast when needed."""
 
 from __future__ import annotations
 

@@ -181,7 +181,10 @@ def _frozen_solids(part: Parts, spec: SceneSetSpec, directory: Path) -> list[Sol
             [name for name in _piece_names(kind, len(stored.files)) if name in stored.files]
             for kind in range(len(part.parts))
         ]
-        return [Solid(one, tuple(stored[name] for name in own)) for one, own in zip(part.parts, names, strict=True)]
+        return [
+            Solid(member, tuple(stored[name] for name in piece_names))
+            for member, piece_names in zip(part.parts, names, strict=True)
+        ]
 
 
 def _piece_names(kind: int, count: int) -> list[str]:

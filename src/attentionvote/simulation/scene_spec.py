@@ -1,4 +1,4 @@
-"""What determines a scene set: the specification, its digest, and where the set lives."""
+"""Specification of a scene set: everything that determines it, its digest, and its folder."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def scene_figure(part: Parts, record: SceneRecord, scene: Scene, max_shown: int 
     )
     kinds = [part.parts[kind] for kind in record.part_ids]
     posed = [apply(pose, kind.vertices) for pose, kind in zip(record.camera_from_part, kinds, strict=True)]
-    first = np.cumsum([0, *(len(own) for own in posed)])
+    first = np.cumsum([0, *(len(placed) for placed in posed)])
     vertices = np.concatenate(posed)
     faces = np.concatenate([kind.faces + start for kind, start in zip(kinds, first, strict=False)])
     figure.add_trace(

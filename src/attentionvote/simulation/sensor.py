@@ -1,4 +1,4 @@
-"""From a stored scene to the point cloud a depth sensor would deliver.
+"""Simulated depth sensor: the point cloud that it would deliver of a stored scene.
 
 Rays are cast at random pixels of the picture, so a cloud of 40,000 points costs 40,000 hits, not a whole image.
 """
@@ -109,14 +109,14 @@ def synthesize(
     order = random_order(width * height, rng)
     points: list[Floats] = []
     ids: list[NDArray[np.int32]] = []
-    found, used = 0, 0
-    while found < max_points and used < len(order):
+    measured_count, used = 0, 0
+    while measured_count < max_points and used < len(order):
         # The share of pixels that end as points is guessed for the first rays and known for the rest.
-        yielded = found / used if used else 0.5
-        batch = int((max_points - found) / max(yielded, 0.02) * 1.03) + 64
-        chosen = order[used : used + batch]
-        used += len(chosen)
-        pixels = np.stack([chosen % width + u0, chosen // width + v0], axis=1)
+        yielded = measured_count / used if used else 0.5
+        batch = int((max_points - measured_count) / max(yielded, 0.02) * 1.03) + 64
+        pixel_ids = order[used : used + batch]
+        used += len(pixel_ids)
+        pixels = np.stack([pixel_ids % width + u0, pixel_ids // width + v0], axis=1)
         rays, incidence = record.camera.rays(pixels), scanner is not None
         hits = caster.cast(poses, rays, surface, record.part_ids, background=False, normals=incidence)
         if scanner is not None:
@@ -127,7 +127,7 @@ def synthesize(
             new_ids = hits.instance[foreground]
         points.append(new_points)
         ids.append(new_ids)
-        found += len(new_points)
+        measured_count += len(new_points)
     cloud = np.concatenate([np.zeros((0, 3)), *points])[:max_points]
     if sensor.preset == "gaussian":
         cloud = cloud + rng.normal(scale=sensor.sigma_mm / 1000, size=cloud.shape)

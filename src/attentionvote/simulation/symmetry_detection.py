@@ -212,9 +212,9 @@ class _Detection:
 
     def _any_direction(self) -> Symmetry:
         """Three equal principal moments: a regular polyhedron's group, or an accident of proportions."""
-        found = search_axes(self.check)
+        axes = search_axes(self.check)
         revolutions: list[Array] = []
-        for u, _ in found:
+        for u, _ in axes:
             is_new = all(abs(u @ v) < np.cos(0.1) for v in revolutions)
             if is_new and self.check.holds(tested_rotations(Symmetry("revolution", axis_of(u)))):
                 revolutions.append(u)
@@ -224,17 +224,17 @@ class _Detection:
             return self._single_axis(
                 revolutions[0], np.asarray(Symmetry("none", axis_of(revolutions[0])).perpendicular)
             )
-        if not found:
+        if not axes:
             return Symmetry()
-        group = closure(np.stack([pose.rotation_about(u, 2 * np.pi / n) for u, n in found]))
+        group = closure(np.stack([pose.rotation_about(u, 2 * np.pi / n) for u, n in axes]))
         # A group about one axis has at most half turns across it; a polyhedron's has several axes of order >= 3.
-        many = [u for u, n in found if n > 2]
-        has_one_axis = all(abs(u @ many[0]) > np.cos(0.1) for u in many)
-        if group is not None and not has_one_axis:
+        many = [u for u, n in axes if n > 2]
+        has_single_axis = all(abs(u @ many[0]) > np.cos(0.1) for u in many)
+        if group is not None and not has_single_axis:
             symmetry = Symmetry("group", quaternions=quaternions_of(group))
             if self._accept(symmetry):
                 return symmetry
-        axis = max(found, key=lambda item: (item[1], sum(abs(item[0] @ u) < 0.05 for u, _ in found)))[0]
+        axis = max(axes, key=lambda item: (item[1], sum(abs(item[0] @ u) < 0.05 for u, _ in axes)))[0]
         return self._single_axis(axis, np.asarray(Symmetry("none", axis_of(axis)).perpendicular))
 
 

@@ -32,7 +32,7 @@ def search_axes(check: RotationCheck, step: float = np.radians(4.0)) -> list[tup
     Coarse lattice of directions, then a local refinement of the best minima, then the full check.
     """
     axes = hemisphere(step)
-    found: list[tuple[Array, int]] = []
+    symmetries: list[tuple[Array, int]] = []
     for order in ORDERS:
         angle = 2 * np.pi / order
         scores = np.array([check.mean(rotation_about(u, angle)) for u in axes])
@@ -44,11 +44,11 @@ def search_axes(check: RotationCheck, step: float = np.radians(4.0)) -> list[tup
             if scores[i] > HOPELESS * check.radius:
                 break
             axis = refine_axis(check, axes[i], angle)
-            if any(n == order and abs(axis @ u) > np.cos(step / 2) for u, n in found):
+            if any(n == order and abs(axis @ u) > np.cos(step / 2) for u, n in symmetries):
                 continue
             if check.holds(rotation_about(axis, angle)[None]):
-                found.append((axis, order))
-    return found
+                symmetries.append((axis, order))
+    return symmetries
 
 
 def refine_axis(check: RotationCheck, axis: Array, angle: float) -> Array:

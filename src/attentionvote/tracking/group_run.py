@@ -31,15 +31,15 @@ def open_group(store: str | None, experiment: str, name: str, digest: str, **set
     """
     uri = resolve_store(store)
     client = connect(uri)
-    place = experiment_id(client, uri, experiment)
+    group_experiment = experiment_id(client, uri, experiment)
     with exclusive(uri):
-        found = client.search_runs([place], f"tags.`{GROUP_TAG}` = '{digest}'", max_results=1)
-        if found:
-            run_id = found[0].info.run_id
+        runs = client.search_runs([group_experiment], f"tags.`{GROUP_TAG}` = '{digest}'", max_results=1)
+        if runs:
+            run_id = runs[0].info.run_id
         else:
             # The first session is counted 0 when start_run opens it.
             tags = {GROUP_TAG: digest, "sessions": "-1"}
-            run_id = client.create_run(place, run_name=name, tags=tags).info.run_id
+            run_id = client.create_run(group_experiment, run_name=name, tags=tags).info.run_id
     return start_run(uri, run_id=run_id, system_interval_s=0, **settings)
 
 

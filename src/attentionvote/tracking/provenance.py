@@ -1,4 +1,4 @@
-"""Where a result comes from: commit and uncommitted changes, package versions, hardware."""
+"""Provenance of a result: commit and uncommitted changes, package versions, hardware."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ def git_state(folder: Path, patch_limit: int = PATCH_LIMIT_BYTES) -> GitState:
     commit = (_git(folder, "rev-parse", "HEAD") or b"").decode().strip()
     if not commit:
         return GitState("unknown", "", "")
-    told = _git(folder, "status", "--porcelain", "--untracked-files=all")
-    if told == b"":
+    listing = _git(folder, "status", "--porcelain", "--untracked-files=all")
+    if listing == b"":
         return GitState(commit, "", "")
-    status = "unknown\n" if told is None else told[:100_000].decode(errors="replace")
+    status = "unknown\n" if listing is None else listing[:100_000].decode(errors="replace")
     changes = _changes(folder)
     whole = bool(changes) and len(changes or b"") <= patch_limit and _is_text(changes or b"")
     changes = changes if changes is not None else _git(folder, "diff", *_PLAIN, "HEAD") or b""
@@ -92,17 +92,17 @@ def _changes(folder: Path) -> bytes | None:
     """
     index, objects = ((_git(folder, "rev-parse", "--git-path", name) or b"").decode().strip() for name in _PLACES)
     with tempfile.TemporaryDirectory(prefix="attentionvote-") as scratch:
-        own = {"GIT_INDEX_FILE": f"{scratch}/index", "GIT_OBJECT_DIRECTORY": f"{scratch}/objects"}
-        own["GIT_ALTERNATE_OBJECT_DIRECTORIES"] = str((folder / objects).resolve())
+        environment = {"GIT_INDEX_FILE": f"{scratch}/index", "GIT_OBJECT_DIRECTORY": f"{scratch}/objects"}
+        environment["GIT_ALTERNATE_OBJECT_DIRECTORIES"] = str((folder / objects).resolve())
         try:
-            Path(own["GIT_OBJECT_DIRECTORY"]).mkdir()
+            Path(environment["GIT_OBJECT_DIRECTORY"]).mkdir()
             # With its time: by it git knows which files may have changed within the second it was written in.
-            shutil.copy2(folder / index, own["GIT_INDEX_FILE"])
+            shutil.copy2(folder / index, environment["GIT_INDEX_FILE"])
         except OSError:
             return None
-        if _git(folder, "add", "--all", environment=own) is None:
+        if _git(folder, "add", "--all", environment=environment) is None:
             return None
-        return _git(folder, "diff", *_PLAIN, "--cached", "--full-index", "HEAD", environment=own)
+        return _git(folder, "diff", *_PLAIN, "--cached", "--full-index", "HEAD", environment=environment)
 
 
 def _is_text(patch: bytes) -> bool:

@@ -47,18 +47,18 @@ class Run:
     """
 
     def __init__(self, client: MlflowClient, uri: str, run_id: str, system_interval_s: float) -> None:
-        found = client.get_run(run_id)
+        stored = client.get_run(run_id)
         self.id: str = run_id
         self.store = uri
         self.commit = ""  # of the code that runs, as a model's card names it
-        self.experiment_id: str = found.info.experiment_id
+        self.experiment_id: str = stored.info.experiment_id
         self.experiment: str = client.get_experiment(self.experiment_id).name
         self.status: str = "RUNNING"
         self._client = client
-        self._params: dict[str, str] = dict(found.data.params)
-        last_steps = {metric.key: metric.step for metric in found.data.to_proto().metrics}
+        self._params: dict[str, str] = dict(stored.data.params)
+        last_steps = {metric.key: metric.step for metric in stored.data.to_proto().metrics}
         self._metrics = MetricWriter(client, run_id, last_steps)
-        self._artifacts = ArtifactWriter(client, run_id, found.info.artifact_uri)
+        self._artifacts = ArtifactWriter(client, run_id, stored.info.artifact_uri)
         self._sampler: SystemSampler | None = None
         if system_interval_s > 0:
             first = self._metrics.last_step("system/cpu_percent") + 1

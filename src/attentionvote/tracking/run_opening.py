@@ -65,7 +65,7 @@ def start_run(
     client = connect(uri)
     from mlflow.exceptions import MlflowException
 
-    def known(argument: str, name: str) -> MlflowRun:
+    def existing_run(argument: str, name: str) -> MlflowRun:
         try:
             return client.get_run(name)
         except MlflowException as error:
@@ -73,18 +73,18 @@ def start_run(
                 f"{argument} must name a run in {shown(uri)}, got {name!r}, which it does not have"
             ) from error
 
-    below = {} if parent is None else {PARENT_TAG: known("parent", parent).info.run_id}
+    below = {} if parent is None else {PARENT_TAG: existing_run("parent", parent).info.run_id}
     if run_id is None:
-        place = experiment_id(client, uri, experiment)
-        run_id = client.create_run(place, run_name=name, tags={"sessions": "0", **below}).info.run_id
+        in_experiment = experiment_id(client, uri, experiment)
+        run_id = client.create_run(in_experiment, run_name=name, tags={"sessions": "0", **below}).info.run_id
         session = 0
     else:
-        found = known("run_id", run_id)
-        below = {} if PARENT_TAG in found.data.tags else below
-        if found.info.lifecycle_stage == "deleted":
+        stored = existing_run("run_id", run_id)
+        below = {} if PARENT_TAG in stored.data.tags else below
+        if stored.info.lifecycle_stage == "deleted":
             client.restore_run(run_id)
         client.update_run(run_id, status="RUNNING")  # FAILED or KILLED before, or left RUNNING by a kill -9
-        session = int(found.data.tags.get("sessions", "0")) + 1
+        session = int(stored.data.tags.get("sessions", "0")) + 1
     run = Run(client, uri, run_id, system_interval_s)
     try:
         _record_origin(run, session, config_yaml, repository or Path.cwd())

@@ -1,4 +1,4 @@
-"""Where runs are kept: choose the store, make sure that it exists, connect to it."""
+"""The store of the runs: choose it, make sure that it exists, connect to it."""
 
 from __future__ import annotations
 
@@ -167,9 +167,9 @@ def _check_access(client: MlflowClient, uri: str) -> None:
             sentence = str(error).strip().splitlines()[0]
             raise ConnectionError(f"tracking server {uri} must answer as MLflow does, got: {sentence}") from error
         user = read_mlflow_creds().username
-        given = f"it refuses those of {user!r}" if user else "it got none"
+        refusal = f"it refuses those of {user!r}" if user else "it got none"
         raise ConnectionError(
-            f"tracking server {uri} must be given user and password, {given} (HTTP {status}): {_CREDENTIALS}"
+            f"tracking server {uri} must be given user and password, {refusal} (HTTP {status}): {_CREDENTIALS}"
         ) from error
 
 
@@ -222,7 +222,7 @@ def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
 
     try:
         with exclusive(uri):
-            return _found_or_made(client, uri, name)
+            return _ensured_experiment(client, uri, name)
     except MlflowException as error:
         if error.get_http_status_code() != 403:
             raise
@@ -232,7 +232,7 @@ def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
         ) from error
 
 
-def _found_or_made(client: MlflowClient, uri: str, name: str) -> str:
+def _ensured_experiment(client: MlflowClient, uri: str, name: str) -> str:
     from mlflow.exceptions import MlflowException
 
     root = artifact_root(uri)

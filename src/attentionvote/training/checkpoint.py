@@ -65,11 +65,11 @@ def usable_checkpoint(paths: Sequence[Path], shapes: Mapping[str, torch.Size]) -
             continue
         try:
             content = torch.load(path, map_location="cpu", weights_only=True)
-            found = {name: value.shape for name, value in content["state_dict"].items()}
+            stored_shapes = {name: value.shape for name, value in content["state_dict"].items()}
         except Exception as error:  # whatever torch says of a torn file: it cannot be used
             log.warning("checkpoint %s cannot be read (%s) and is passed over", path, type(error).__name__)
             continue
-        if found == dict(shapes):
+        if stored_shapes == dict(shapes):
             return path
         log.warning("checkpoint %s belongs to another network and is passed over", path)
     return None
@@ -96,7 +96,7 @@ def load_trained(path: Path | str) -> tuple[AttentionVote, dict[str, Any]]:
     Reads ``model.ckpt`` and the training's ``best.ckpt`` and ``last.ckpt`` alike. The metadata:
 
     * ``format``, ``version``: of this file's layout and of the package that wrote it;
-    * ``model``: arguments of ``AttentionVote``;
+    * ``model``: arguments of ``AttentionVote.from_arguments``;
     * ``part``: ``name``, ``title``, ``diameter`` (metres), ``digest``, ``symmetry``;
     * ``parts``: of a set the same of each, in the order of the classes; ``part`` is then the set, without symmetry;
     * ``points``: N of a sample; ``clouds``: sensor, density, pool and neighbours of the normals;
@@ -125,10 +125,10 @@ def load_trained(path: Path | str) -> tuple[AttentionVote, dict[str, Any]]:
             f"it was written by attentionvote {metadata.get('version', 'of an unknown version')}"
         )
     try:
-        model = AttentionVote(**metadata["model"])
+        model = AttentionVote.from_arguments(metadata["model"])
         weights = content["state_dict"].items()
         model.load_state_dict({name.removeprefix(_PREFIX): v for name, v in weights if name.startswith(_PREFIX)})
-    except (RuntimeError, TypeError, KeyError) as error:
+    except (RuntimeError, TypeError, KeyError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise ValueError(f"checkpoint {path} does not fit this version's network: {reason}") from error
     return model.eval(), metadata

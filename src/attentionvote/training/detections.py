@@ -1,4 +1,4 @@
-"""From the network's answers to what the evaluation compares with the truth."""
+"""Detections of the network's answers, beside the truth, as the evaluation compares them."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def scene_results(
     heat, confidence = predictions.peak_heat.float().cpu().numpy(), predictions.confidence.float().cpu().numpy()
     rotation = matrix_from_quaternion(predictions.quaternion.double().cpu().numpy())
     poses = transform(rotation, predictions.center.double().cpu().numpy())
-    kept = is_detection(heat, confidence, peak_threshold, confidence_threshold)
+    detected = is_detection(heat, confidence, peak_threshold, confidence_threshold)
     truth = transform(batch.rotation.double().cpu().numpy(), batch.center.double().cpu().numpy())
     real = (batch.center.abs().sum(-1) > 0).cpu().numpy()
     visible = batch.visible.double().cpu().numpy()
     named, part = predictions.class_logits.float().cpu().numpy().argmax(-1), batch.part.cpu().numpy()
     for i in range(len(poses)):
         occlusion = 1.0 - np.minimum(visible[i, real[i]], 1.0)
-        found = poses[i, kept[i]], confidence[i, kept[i]]
-        results.append(SceneResult(*found, truth[i, real[i]], occlusion, named[i, kept[i]], part[i, real[i]]))
+        prediction = poses[i, detected[i]], confidence[i, detected[i]]
+        results.append(SceneResult(*prediction, truth[i, real[i]], occlusion, named[i, detected[i]], part[i, real[i]]))
     return results

@@ -69,14 +69,17 @@ class AttentionVoteLoss:
 
     def vote_terms(self, votes: Votes, batch: Batch) -> dict[str, Tensor]:
         """Eq. (1), mean over the seeds that lie on an instance, and the votes' rotations."""
+        # [b, n] -> [b, m]
         instance = torch.take_along_dim(batch.instance, votes.seed_index, dim=1)
         on_part = instance >= 0
         index = instance.clamp(min=0)
         rows = torch.arange(len(index), device=index.device)[:, None]
+        # [b, i, ...] -> [b, m, ...], i instances of a sample
         aim, part = batch.center[rows, index], batch.part[rows, index]
         error = ((votes.xyz - aim).square().sum(-1) + 1e-12).sqrt() / self._unit(part, votes.xyz)
         terms = {"vote": masked_mean(error, on_part)}
         if votes.rotation is not None:
+            # [b, m, ...] -> [b * m, ...]
             turn = self.training_pose.rotation_loss(
                 "metric",
                 part.flatten(),
@@ -84,13 +87,16 @@ class AttentionVoteLoss:
                 votes.rotation.flatten(0, 1),
                 batch.rotation[rows, index].flatten(0, 1),
             )
+            # [b * m] -> [b, m]
             terms["vote_rotation"] = masked_mean(turn.view_as(error), on_part)
         return terms
 
     def assign(self, peaks: Peaks, batch: Batch, rows: Int[Tensor, " rows"]) -> Assignment:
         """The nearest visible instance of every proposal, whatever its part (paper, "Assigning instance labels")."""
         sample = rows // peaks.heat.shape[1]
+        # [b, k, 3] -> [b * k, 3] -> [r, 3]
         seed = peaks.center_seed.flatten(0, 1)[rows]
+        # [r, 1, 3] - [r, i, 3] -> [r, i]
         distance = (seed[:, None] - batch.center[sample]).norm(dim=-1)
         visible = batch.visible[sample]
         # Padding has visibility 0 and lies at the origin.
@@ -144,9 +150,11 @@ class AttentionVoteLoss:
             right = right & (poses.class_logits.argmax(1) == part)
         distance = distance.masked_fill(~right, torch.inf)
         share = distance / self.true_pose.diameter(part, distance.dtype)
+        # [r, 1] < [3] -> [r, 3] -> [r]
         quality = (share[:, None] < share.new_tensor(QUALITY_STEPS)).to(poses.score.dtype).mean(1)
         if not self.settings.one_per_instance:
             return quality
+        # [r] -> row of [b * i], one a sample's instance
         key = assigned.sample * batch.visible.shape[1] + assigned.instance
         best = torch.full((int(batch.visible.numel()),), torch.inf, dtype=distance.dtype, device=distance.device)
         best = best.scatter_reduce(0, key, distance, "amin")
@@ -155,6 +163,7 @@ class AttentionVoteLoss:
     def _truth(self, assigned: Assignment, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Part, centre and rotation of every row's instance."""
         at = assigned.sample, assigned.instance
+        # [b, i, ...] -> [r, ...]
         return batch.part[at], batch.center[at], batch.rotation[at]
 
     def _unit(self, part: Int[Tensor, "*rows"], lengths: Tensor) -> Float[Tensor, "*rows"] | float:

@@ -1,4 +1,4 @@
-"""What Lightning and torch say during a training, and what of it is for people."""
+"""Messages of Lightning and torch during a training, and the few of them that are for people."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ class PoseTraining(L.LightningModule):
         """What the network answers; never with the larger radius of the warm-up."""
         self.model.voting_radius = self.voting_radius
         batch = self.fitting(batch)
-        predictions: Predictions = self.model(batch.points, batch.normals, batch.found)
+        predictions: Predictions = self.model(batch.points, batch.normals, batch.neighborhoods)
         return predictions
 
     def fitting(self, batch: Batch) -> Batch:

@@ -1,4 +1,4 @@
-"""Which confidence a detection must have: chosen on validation scenes, kept with the model."""
+"""The confidence that a detection must have: selected on validation scenes, stored with the model."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ def best_threshold(scenes: Sequence[SceneResult], part: Parts, fraction: float =
         part: their part, or set of parts; D is then that of each, and the detections of all count together.
         fraction: of D.
     """
-    metrics = [PoseMetric.of(one) for one in part.parts]
+    metrics = [PoseMetric.of(member) for member in part.parts]
     best, best_f1 = 0.0, -1.0
     for threshold in candidates(scenes):
         right = wrong = missed = 0
         for scene in confident(scenes, threshold):
-            for k, (one, metric) in enumerate(zip(part.parts, metrics, strict=True)):
-                own = scene.of_part(k)
-                distances = metric.distances(own.poses, own.gt_poses)
-                found = match(distances, own.scores, own.to_find(), fraction * one.diameter)
-                right += len(found.true_positives)
-                wrong, missed = wrong + len(found.false_positives), missed + len(found.misses)
+            for k, (member, metric) in enumerate(zip(part.parts, metrics, strict=True)):
+                part_scene = scene.of_part(k)
+                distances = metric.distances(part_scene.poses, part_scene.gt_poses)
+                matching = match(distances, part_scene.scores, part_scene.to_find(), fraction * member.diameter)
+                right += len(matching.true_positives)
+                wrong, missed = wrong + len(matching.false_positives), missed + len(matching.misses)
         f1 = 2 * right / max(1, 2 * right + wrong + missed)
         if f1 > best_f1 + 1e-9:
             best, best_f1 = float(threshold), f1

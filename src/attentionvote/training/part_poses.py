@@ -16,7 +16,7 @@ from torch import Tensor
 
 from attentionvote.model.precision import full_precision
 from attentionvote.part import Parts
-from attentionvote.training.pose_loss import _TINY, RotationLoss, SymmetricPose
+from attentionvote.training.pose_loss import RotationLoss, SymmetricPose, metric_loss
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class PartPoses:
     @classmethod
     def of(cls, part: Parts, isotropic: float = 0.0) -> PartPoses:
         """Those of a part or a set of parts, see ``SymmetricPose.of``."""
-        return cls(tuple(SymmetricPose.of(one, isotropic) for one in part.parts))
+        return cls(tuple(SymmetricPose.of(member, isotropic) for member in part.parts))
 
     def diameter(self, part: Int[Tensor, "*rows"], dtype: torch.dtype) -> Float[Tensor, "*rows"] | float:
         """D in metres of every row's part, in the precision of ``dtype``; one number where all are the same."""
@@ -42,9 +42,12 @@ class PartPoses:
         """As ``SymmetricPose.squared_turn``, by each row's own part."""
         if len(self.each) == 1:
             return self.each[0].squared_turn(predicted, true)
+        # [parts, ...] -> [r, ...]
         representation, equivalents = (t.to(predicted.dtype).to(true.device)[part] for t in self._tables)
         with full_precision(true.device):
+            # [r, 1, 3, 3] @ [r, g, 3, 3] -> [r, g, 3, 3]
             aims = true[:, None] @ equivalents
+            # [r, 3, 3] -> [r, 1, 3, 3]
             now = (predicted @ representation)[:, None]
             return (now - aims).square().sum((-2, -1)).amin(1)
 
@@ -72,11 +75,10 @@ class PartPoses:
         Raises:
             ValueError: on an unknown ``kind``.
         """
+        if kind == "metric":
+            return metric_loss(self.squared_turn(part, rotation, true), self.diameter(part, rotation.dtype))
         if len(self.each) == 1:
             return self.each[0].rotation_loss(kind, quaternion, rotation, true)
-        if kind == "metric":
-            diameter = self.diameter(part, rotation.dtype)
-            return (self.squared_turn(part, rotation, true) + (_TINY * diameter) ** 2).sqrt() / (0.1 * diameter)
         # Quaternion forms enumerate the equivalents in numpy: part by part is no slower.
         loss = rotation.new_zeros(len(part))
         for index, pose in enumerate(self.each):

@@ -68,15 +68,15 @@ def picture_inputs(module: PoseTraining, batch: Batch, confidence_threshold: flo
     """
     batch = module.fitting(batch)
     results = module.detect(batch)
-    votes = module.model.cast_votes(batch.points, batch.normals, batch.found)
+    votes = module.model.cast_votes(batch.points, batch.normals, batch.neighborhoods)
     peaks = module.model.find_peaks(votes)
     parts = module.part.parts
     for i, result in enumerate(results):
         sure = result.above(confidence_threshold)
         correct = np.zeros(len(sure.poses), dtype=bool)
         for k, part in enumerate(parts):
-            own = sure.of_part(k)
-            distances = PoseMetric.of(part).distances(own.poses, own.gt_poses)
+            part_result = sure.of_part(k)
+            distances = PoseMetric.of(part).distances(part_result.poses, part_result.gt_poses)
             correct[sure.part_ids == k] = distances.min(axis=1, initial=np.inf) <= 0.1 * part.diameter
         visible = result.gt_occlusion <= 0.5
         yield {

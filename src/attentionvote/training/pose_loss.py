@@ -72,9 +72,10 @@ class SymmetricPose:
     ) -> Float[Tensor, " rows"]:
         """Square of the rotational distance in square metres, minimum over the symmetry group."""
         with full_precision(true.device):
-            own = self.like(predicted)
-            aims = true[:, None] @ (own.group @ own.representation)
-            return (predicted[:, None] @ own.representation - aims).square().sum((-2, -1)).amin(1)
+            tables = self.like(predicted)
+            # [r, 1, 3, 3] @ [g, 3, columns] -> [r, g, 3, columns]
+            aims = true[:, None] @ (tables.group @ tables.representation)
+            return (predicted[:, None] @ tables.representation - aims).square().sum((-2, -1)).amin(1)
 
     def distance(
         self,
@@ -99,23 +100,32 @@ class SymmetricPose:
             ValueError: on an unknown ``kind``.
         """
         if kind == "metric":
-            return (self.squared_turn(rotation, true) + (_TINY * self.diameter) ** 2).sqrt() / (0.1 * self.diameter)
+            return metric_loss(self.squared_turn(rotation, true), self.diameter)
         if kind not in get_args(RotationLoss):
             raise ValueError(f"rotation loss must be one of {', '.join(get_args(RotationLoss))}, got {kind!r}")
-        own = self.like(rotation)
-        if own.axis is not None:
+        tables = self.like(rotation)
+        if tables.axis is not None:
             with full_precision(true.device):
-                aims = torch.einsum("rij,gjk,k->rgi", true, own.group, own.axis)
-                axes = (rotation @ own.axis)[:, None]
+                aims = torch.einsum("rij,gjk,k->rgi", true, tables.group, tables.axis)
+                # [r, 3, 3] @ [3] -> [r, 1, 3], against [r, g, 3]
+                axes = (rotation @ tables.axis)[:, None]
                 return angle_between(axes, aims).amin(1)
         return quaternion_loss(kind, quaternion[:, None], self._equivalents(true)).amin(1)
 
     def _equivalents(self, true: Tensor) -> Tensor:
         """Canonical quaternions ``(rows, G, 4)`` of the equivalent rotations: here, and only here, the sign that
         Eq. (6) depends on becomes part of the label."""
+        # [r, 1, 3, 3] @ [g, 3, 3] -> [r, g, 3, 3]
         matrices = true[:, None].detach().cpu().numpy() @ self.group.cpu().numpy()
         quaternions = canonical_quaternion(quaternion_from_matrix(matrices))
         return torch.from_numpy(quaternions).to(true.dtype).to(true.device)
+
+
+def metric_loss(
+    squared_turn: Float[Tensor, " rows"], diameter: Float[Tensor, " rows"] | float
+) -> Float[Tensor, " rows"]:
+    """Rotational distances in units of 0.1 D, with a bounded gradient where there is none."""
+    return (squared_turn + (_TINY * diameter) ** 2).sqrt() / (0.1 * diameter)
 
 
 def quaternion_loss(

@@ -1,4 +1,4 @@
-"""What the processes of one training tell each other; in a process of its own every function is the identity.
+"""Exchange between the processes of one training; where there is one process every function is the identity.
 
 ``torchrun`` starts the processes, ``joined`` makes them a group. Numbers of the network go through the group's own
 backend (gloo on a CPU, nccl on GPUs), Python objects through gloo. Where one process works for minutes or hours and
@@ -53,11 +53,11 @@ def everyones(values: Tensor) -> Tensor:
 
     Every process gets the same bits, which a sum need not give.
     """
-    own = values.detach().contiguous()
+    local = values.detach().contiguous()
     if count() == 1:
-        return own[None]
-    rows = [torch.empty_like(own) for _ in range(count())]
-    dist.all_gather(rows, own)
+        return local[None]
+    rows = [torch.empty_like(local) for _ in range(count())]
+    dist.all_gather(rows, local)
     return torch.stack(rows)
 
 
@@ -90,14 +90,14 @@ def joined(device: torch.device) -> Iterator[FirstDoes]:
         what lets the first process work alone while the others wait, for as long as it takes.
     """
     global _objects
-    store, own_rank, world_size = next(dist.rendezvous("env://"))
+    store, process_rank, world_size = next(dist.rendezvous("env://"))
     if device.type == "cuda":
         torch.cuda.set_device(device)
     cuda = device if device.type == "cuda" else None
     dist.init_process_group(
         "nccl" if cuda else "gloo",
         store=dist.PrefixStore("group", store),
-        rank=own_rank,
+        rank=process_rank,
         world_size=world_size,
         timeout=_TIMEOUT,
         device_id=cuda,
@@ -106,7 +106,7 @@ def joined(device: torch.device) -> Iterator[FirstDoes]:
 
     def first_does(name: str, work: Callable[[], Any]) -> Any:
         key = f"first/{name}"
-        if own_rank == 0:
+        if process_rank == 0:
             result = work()
             store.set(key, json.dumps(result))
             return result
@@ -118,8 +118,8 @@ def joined(device: torch.device) -> Iterator[FirstDoes]:
         yield first_does
         # The first one leaves last: the store may be in its process, and torchrun elsewhere would not wait for long.
         first_does("end", lambda: None)
-        if own_rank:
-            store.set(f"left/{own_rank}", "")
+        if process_rank:
+            store.set(f"left/{process_rank}", "")
         else:
             store.wait([f"left/{other}" for other in range(1, world_size)], _TIMEOUT)
         dist.destroy_process_group()

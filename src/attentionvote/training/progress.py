@@ -1,4 +1,4 @@
-"""What a person sees during training: one bar over all steps with the time left, the losses and the last AP."""
+"""Progress of a training for people: one bar over all steps with the time left, the losses and the last AP."""
 
 from __future__ import annotations
 

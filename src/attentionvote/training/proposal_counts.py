@@ -1,4 +1,4 @@
-"""How the proposals cover the instances of a scene: is any left out, is any proposed twice?
+"""Coverage of a scene's instances by the proposals: is any left out, is any proposed twice?
 
 The paper says that its heatmap avoids what sampling does: proposals that "may deviate from the ground-truth centers or
 overlap on the same one" (section 3.2). That is a claim about proposals, so it is counted on proposals: before the
@@ -55,9 +55,9 @@ def proposal_counts(
     center, visible = batch.center.double().cpu().numpy(), batch.visible.double().cpu().numpy()
     reach = np.atleast_1d(np.asarray(radius, dtype=np.float64))
     reach = reach[batch.part.cpu().numpy()] if len(reach) > 1 else np.broadcast_to(reach, visible.shape)
-    kept, seen = (heat >= peak_threshold) & (heat > 0), visible > 0
+    hot, seen = (heat >= peak_threshold) & (heat > 0), visible > 0
     return [
-        _counts(seed[i, kept[i]], center[i, seen[i]], visible[i, seen[i]] >= LEAST_VISIBLE, reach[i, seen[i]])
+        _counts(seed[i, hot[i]], center[i, seen[i]], visible[i, seen[i]] >= LEAST_VISIBLE, reach[i, seen[i]])
         for i in range(len(seed))
     ]
 

@@ -21,15 +21,16 @@ def batch_loss(
         ramp: 0 during the warm-up, when only the votes are trained; the proposals are then not computed at all.
         least_heat: proposals with less heat are left out of training; so are places beyond the last peak (heat 0).
     """
-    votes = model.cast_votes(batch.points, batch.normals, batch.found)
+    votes = model.cast_votes(batch.points, batch.normals, batch.neighborhoods)
     terms = loss.vote_terms(votes, batch)
     if ramp <= 0:
         return terms
     peaks = model.find_peaks(votes)
+    # [b, k] -> [b * k]
     heat = peaks.heat.flatten()
     rows = torch.nonzero((heat >= least_heat) & (heat > 0))[:, 0]
-    rows, chosen = _even_choice(rows, loss.settings.rows_per_scene * len(batch.points), len(heat))
-    if chosen < 2:  # batch statistics need two rows
+    rows, selected_count = _even_choice(rows, loss.settings.rows_per_scene * len(batch.points), len(heat))
+    if selected_count < 2:  # batch statistics need two rows
         return terms
     poses = model.regress(votes, peaks, rows)
     assigned = loss.assign(peaks, batch, rows)
@@ -44,7 +45,7 @@ def batch_loss(
     return terms
 
 
-def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[Int[Tensor, " chosen"], int]:
+def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[Int[Tensor, " selected"], int]:
     """Every n-th row of the whole batch, so that ``most`` a process are left at most on average.
 
     Args:
@@ -53,14 +54,14 @@ def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[In
         places: rows that each process could have; the whole batch is the processes' places one after the other.
 
     Returns:
-        this process's share of the choice, and the number of all chosen rows.
+        this process's share of the choice, and the number of all selected rows.
     """
-    told = everyones(torch.stack([rows.new_tensor(len(rows)), rows.sum()])).tolist()
-    count = sum(size for size, _ in told)
-    stride = -(-count // (most * len(told)))
+    totals = everyones(torch.stack([rows.new_tensor(len(rows)), rows.sum()])).tolist()
+    count = sum(size for size, _ in totals)
+    stride = -(-count // (most * len(totals)))
     if stride <= 1:
         return rows, count
     # Which ones is as good as random, and the same in a continued training.
-    first = sum(total + size * places * process for process, (size, total) in enumerate(told)) % stride
-    before = sum(size for size, _ in told[: rank()])
+    first = sum(total + size * places * process for process, (size, total) in enumerate(totals)) % stride
+    before = sum(size for size, _ in totals[: rank()])
     return rows[(first - before) % stride :: stride], len(range(first, count, stride))

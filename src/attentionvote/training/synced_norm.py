@@ -24,11 +24,13 @@ class SyncedRowNorm(RowNorm):
         """Normalise each channel over the rows of all processes (running statistics in evaluation)."""
         if not self.training:
             return super().forward(x)
+        # [..., c] -> [r, c]
         rows = x.reshape(-1, x.shape[-1])
         count, mean, variance = _statistics(rows)
         self._remember(count, mean, variance)
         scale = (variance + self.eps).rsqrt()
         out: Tensor = _Normalize.apply(rows, self.weight, self.bias, mean, scale, count)
+        # [r, c] -> [..., c]
         return out.view(x.shape)
 
     @torch.no_grad()
@@ -70,11 +72,12 @@ def _wide(rows: Tensor) -> Tensor:
 def _statistics(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Number, mean and biased variance of the rows of all processes: each tells its own (Chan et al. 1979)."""
     wide = _wide(rows)
-    own_mean = wide.mean(0) if len(wide) else wide.new_zeros(wide.shape[1])
-    own_sum = (wide - own_mean).square().sum(0)
-    size = own_mean.new_full((1,), float(len(wide)), dtype=torch.float64)
-    told = everyones(torch.cat([size, own_mean.double(), own_sum.double()]))
-    counts, means, sums = told[:, :1], *told[:, 1:].chunk(2, dim=1)
+    local_mean = wide.mean(0) if len(wide) else wide.new_zeros(wide.shape[1])
+    local_sum = (wide - local_mean).square().sum(0)
+    size = local_mean.new_full((1,), float(len(wide)), dtype=torch.float64)
+    gathered = everyones(torch.cat([size, local_mean.double(), local_sum.double()]))
+    # [processes, 1 + 2 c] -> [processes, 1] and two of [processes, c]
+    counts, means, sums = gathered[:, :1], *gathered[:, 1:].chunk(2, dim=1)
     count = counts.sum().clamp(min=1.0)
     mean = (counts * means).sum(0) / count
     variance = (sums + counts * (means - mean).square()).sum(0) / count
@@ -94,8 +97,8 @@ class _Normalize(torch.autograd.Function):
         rows, weight, mean, scale, count = ctx.saved_tensors
         gradient = _wide(gradients[0])
         normed = (_wide(rows) - mean) * scale
-        own = torch.stack([gradient.sum(0), (gradient * normed).sum(0)])
+        local_sums = torch.stack([gradient.sum(0), (gradient * normed).sum(0)])
         # A row moves the statistics of all rows, those of other processes included.
-        along, across = summed(own) / count
+        along, across = summed(local_sums) / count
         moved = (gradient - along - normed * across) * (scale * weight)
-        return moved.to(rows.dtype), own[1], own[0], None, None, None
+        return moved.to(rows.dtype), local_sums[1], local_sums[0], None, None, None

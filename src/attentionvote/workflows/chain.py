@@ -44,10 +44,10 @@ class MemberTask:
         answers: dict[str, Any] = {}
         for verb in VERBS:
             # The training that these words mean and its bundle, not the newest ones.
-            chosen = [f"run={answers['train']['run_id']}"] if verb == "export" else []
+            selected = [f"run={answers['train']['run_id']}"] if verb == "export" else []
             if verb == "evaluate":
-                chosen = [f"bundle='{Path(answers['export']['bundle']).name}'"]
-            outcome = self._run(verb, [f"object={name}", *self.words[verb], *chosen], name)
+                selected = [f"bundle='{Path(answers['export']['bundle']).name}'"]
+            outcome = self._run(verb, [f"object={name}", *self.words[verb], *selected], name)
             if outcome.result is None:
                 answers |= {"failed": verb, "sentence": outcome.sentence}
                 break

@@ -242,8 +242,8 @@ def _described(training: Path, result: dict[str, Any]) -> str:
 
 
 def _signing_key(folder: str | None) -> Ed25519PrivateKey:
-    place = keys_folder() if folder is None else Path(folder)
-    if not ((place / PRIVATE_NAME).is_file() and (place / PUBLIC_NAME).is_file()):
-        private, public = make_keys(place)
+    keys = keys_folder() if folder is None else Path(folder)
+    if not ((keys / PRIVATE_NAME).is_file() and (keys / PUBLIC_NAME).is_file()):
+        private, public = make_keys(keys)
         log.info("a signing key was made; keep %s secret, give %s to the cells", private, public)
-    return load_private_key(place / PRIVATE_NAME)
+    return load_private_key(keys / PRIVATE_NAME)

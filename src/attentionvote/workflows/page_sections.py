@@ -33,14 +33,14 @@ def record_of(page: Path, name: str) -> Path:
     return page.with_suffix("") / f"{name}.json"
 
 
-def kept_beside(page: Path, name: str, key: str, writer: str = "make benchmark") -> Any:
+def stored_beside(page: Path, name: str, key: str, writer: str = "make benchmark") -> Any:
     """What earlier calls kept for a section under a key; None before the first.
 
     Raises:
         ValueError: when the file is damaged: the page would lose what it shows.
     """
-    place = record_of(page, name)
-    kept = (read_json(place) or {}).get(key)
-    if kept is None and place.exists():
-        raise ValueError(f"{place} must be what `{writer}` wrote, got a damaged file: mend or remove it")
-    return kept
+    path = record_of(page, name)
+    stored = (read_json(path) or {}).get(key)
+    if stored is None and path.exists():
+        raise ValueError(f"{path} must be what `{writer}` wrote, got a damaged file: mend or remove it")
+    return stored

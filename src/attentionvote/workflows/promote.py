@@ -82,7 +82,7 @@ class PromotionJob:
             measured = self.evaluation.measure(bundles, frozen)
         report = described(self.evaluation, frozen, measured[0])
         show(report)
-        evidence = [self._evidence(one) for one in measured]
+        evidence = [self._evidence(measurement) for measurement in measured]
         origin = self.versions.origin(self.evaluation.bundle.card.run_id, self.evaluation.signer)
         gates = judge(
             self.rules, evidence[0], evidence[1] if champion else None, self.evaluation.bundle.card, origin, len(frozen)
@@ -103,7 +103,7 @@ class PromotionJob:
             self.history.append("refuse", version.number, before, version.digest, self.standing.base, why, facts)
             raise Refused(
                 f"{self.name} version {version.number} stays a candidate, because {why} (first: {failed[0].demands}, "
-                f"got {failed[0].found})",
+                f"got {failed[0].finding})",
                 answer,
             )
         try:
@@ -166,7 +166,9 @@ class PromotionJob:
         if report is None or frozen is None:
             return answer
         return answer | {
-            "gates": {gate.name: {"holds": gate.holds, "demands": gate.demands, "found": gate.found} for gate in gates},
+            "gates": {
+                gate.name: {"holds": gate.holds, "demands": gate.demands, "found": gate.finding} for gate in gates
+            },
             "figures": report["figures"],
             "intervals": report["intervals"],
             "evaluation_set": frozen.digest,
@@ -182,5 +184,5 @@ def _show_gates(gates: Sequence[Gate], against: str) -> None:
         table.add_column(name, overflow="fold")
     for gate in gates:
         mark = "[green]holds[/]" if gate.holds else "[bold red]FAILS[/]"
-        table.add_row(mark, gate.name, gate.demands, gate.found)
+        table.add_row(mark, gate.name, gate.demands, gate.finding)
     Console(stderr=True).print(table)

@@ -49,11 +49,11 @@ def run(cfg: WriteDataSettings) -> dict[str, Any]:
         spec = specs[cfg.split]
         if cfg.format == "ipa":
             _check_ipa_camera(spec.camera.camera)
-    place = Path(cfg.directory) / cfg.format
-    target = place / IPA_SPLITS[cfg.split] / parts.name if cfg.format == "ipa" else place / parts.name / cfg.split
+    layout = Path(cfg.directory) / cfg.format
+    target = layout / IPA_SPLITS[cfg.split] / parts.name if cfg.format == "ipa" else layout / parts.name / cfg.split
     with configuring():
         if cfg.format == "bop":
-            write_bop_models(place / parts.name, parts)
+            write_bop_models(layout / parts.name, parts)
     scene_set = generate_scene_set(
         parts, spec, scene_set_directory(Path(cfg.root), parts.name, spec), cfg.workers or cores()
     )
@@ -84,7 +84,7 @@ def pinhole(camera: Camera) -> PinholeCamera:
     return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def write_ipa(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], said: Callable[[int], None]) -> None:
+def write_ipa(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], report: Callable[[int], None]) -> None:
     """Write scenes in the IPA layout.
 
     A cycle has one picture of its empty bin there, from which readers tell the parts. When the camera moves from scene
@@ -110,10 +110,10 @@ def write_ipa(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], 
         for (depth, owner), (poses, visible) in scenes:
             shown = depth if with_bin else np.where(owner >= 0, depth, np.nan)
             writer.write(record.cycle, shown, owner, poses, visible, record.camera_from_bin)
-        said(done + 1)
+        report(done + 1)
 
 
-def write_bop(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], said: Callable[[int], None]) -> None:
+def write_bop(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], report: Callable[[int], None]) -> None:
     """Write scenes as BOP: a scene a drop cycle, a picture a pile; object ids count from 1 in the set's order."""
 
     from attentionvote.datasets.bop_writer import BopSceneWriter
@@ -129,7 +129,7 @@ def write_bop(folder: Path, caster: PartCaster, records: Sequence[SceneRecord], 
             poses, visible = record.camera_from_part, record.visible_fraction
             writer.write(image, pinhole(record.camera), depth, owner, alone, poses, visible, ids)
             done += 1
-            said(done)
+            report(done)
         writer.finish()
 
 

@@ -34,12 +34,12 @@ def scenes_of(cfg: MeasuredBundle, part: Parts) -> MeasuredScenes:
     Raises:
         ValueError: when the dataset does not hold the part.
     """
-    chosen = cfg.evaluation
-    if chosen.dataset is None:
+    evaluation = cfg.evaluation
+    if evaluation.dataset is None:
         return generated_set(cfg, part, set_spec(cfg, part))
     from attentionvote.measurement.dataset_scenes import DatasetScenes
 
-    return DatasetScenes.find(Path(chosen.dataset), only_part(part, "a dataset's scenes"), chosen.density)
+    return DatasetScenes.find(Path(evaluation.dataset), only_part(part, "a dataset's scenes"), evaluation.density)
 
 
 def generated_set(cfg: MeasuredBundle, part: Parts, spec: SceneSetSpec) -> EvaluationSet:
@@ -54,14 +54,14 @@ def generated_set(cfg: MeasuredBundle, part: Parts, spec: SceneSetSpec) -> Evalu
 
     directory = scene_set_directory(Path(cfg.root) / "scenes", part.name, spec)
     scenes = generate_scene_set(part, spec, directory, cfg.workers or cores())
-    chosen = cfg.evaluation
-    settings = CloudSettings(chosen.sensor, density=chosen.density, pool=chosen.density)
+    evaluation = cfg.evaluation
+    settings = CloudSettings(evaluation.sensor, density=evaluation.density, pool=evaluation.density)
     made = EvaluationSet(scenes, part, settings, spec.split)
     log.info("%s: %s set %s, %d scenes", part.name, spec.split, made.digest[:12], len(made))
     if is_recorded(cfg, part, made) is False:
         log.warning(
             "%s: these scenes are %s, the frozen ones %s: figures of both are not of the same scenes",
-            part.name, scenes.digest[:12], chosen.frozen[part.name][:12],
+            part.name, scenes.digest[:12], evaluation.frozen[part.name][:12],
         )  # fmt: skip
     return made
 

@@ -65,8 +65,8 @@ class EvaluationJob:
     @property
     def is_standard(self) -> bool:
         """Whether the model is measured as cells run it, on the set that decides promotions."""
-        chosen = self.cfg.evaluation
-        return chosen.split == "evaluation" and chosen.dataset is None and not self.otherwise
+        evaluation = self.cfg.evaluation
+        return evaluation.split == "evaluation" and evaluation.dataset is None and not self.otherwise
 
     def evaluation_set(self) -> MeasuredScenes:
         """The scenes to measure on, see ``scenes_of``.
@@ -100,8 +100,8 @@ class EvaluationJob:
             what = "evaluating" if len(bundles) == 1 else "evaluating candidate and champion"
             return track(clouds, f"{self.part.name}: {what}", len(frozen), console=Console(stderr=True))
 
-        chosen = self.cfg.evaluation
-        return measure(bundles, frozen, chosen.threads, shown, chosen.peak_threshold)
+        evaluation = self.cfg.evaluation
+        return measure(bundles, frozen, evaluation.threads, shown, evaluation.peak_threshold)
 
 
 def trusted_key(named: str | None) -> Ed25519PublicKey:
@@ -113,16 +113,16 @@ def trusted_key(named: str | None) -> Ed25519PublicKey:
     return load_public_key(keys_folder() / PUBLIC_NAME if named is None else Path(named))
 
 
-def _folder(place: Path, name: str, part: str) -> Path:
+def _folder(bundles: Path, name: str, part: str) -> Path:
     """The bundle's folder below ``place``: ``latest``, or the only one whose name begins with ``name``."""
-    if name == "latest" and (place / name).exists():
-        return place / name
-    found = [p for p in sorted(place.glob("*")) if p.name.startswith(name) and p.is_dir() and not p.is_symlink()]
-    if len(found) == 1:
-        return found[0]
+    if name == "latest" and (bundles / name).exists():
+        return bundles / name
+    matches = [p for p in sorted(bundles.glob("*")) if p.name.startswith(name) and p.is_dir() and not p.is_symlink()]
+    if len(matches) == 1:
+        return matches[0]
     have = [
-        path.name for path in sorted(place.glob("*")) if (path / "manifest.json").is_file() and not path.is_symlink()
+        path.name for path in sorted(bundles.glob("*")) if (path / "manifest.json").is_file() and not path.is_symlink()
     ]
     if not have:
-        raise ValueError(f"{place} must hold a bundle, got none: run `make export OBJECT={part}`")
-    raise ValueError(f"bundle must name one bundle, {name!r} names {len(found)}; there are {', '.join(have)}")
+        raise ValueError(f"{bundles} must hold a bundle, got none: run `make export OBJECT={part}`")
+    raise ValueError(f"bundle must name one bundle, {name!r} names {len(matches)}; there are {', '.join(have)}")

@@ -35,27 +35,27 @@ def row(name: str, job: TrainingJob, answers: Mapping[str, Any], bundles: Path, 
     """
     evaluated = answers.get("evaluate") or {}
     bundle = bundles / name / "latest"
-    known: dict[str, Any] = {"object": name, "seconds": answers.get("seconds")}
-    known |= {key: evaluated.get("figures", {}).get(key) for key in ("ap_10", "ap_5", "ap_2", "latency_p50_ms")}
-    known["intervals"] = {key: evaluated.get("intervals", {}).get(key) for key in ("ap_10", "ap_5", "ap_2")}
-    known["bundle"], trained_with = None, None
+    entry: dict[str, Any] = {"object": name, "seconds": answers.get("seconds")}
+    entry |= {key: evaluated.get("figures", {}).get(key) for key in ("ap_10", "ap_5", "ap_2", "latency_p50_ms")}
+    entry["intervals"] = {key: evaluated.get("intervals", {}).get(key) for key in ("ap_10", "ap_5", "ap_2")}
+    entry["bundle"], trained_with = None, None
     try:
         loaded = load_bundle(bundle, None)
-        known["bundle"], trained_with = loaded.digest, loaded.card.data
+        entry["bundle"], trained_with = loaded.digest, loaded.card.data
     except BundleError:
         pass  # nothing exported yet
     standing = _standing(store, name)
     champion = standing.champion if standing else None
-    known["champion"] = None
+    entry["champion"] = None
     if standing and champion:
         age_days = None if standing.since_s is None else round((time.time() - standing.since_s) / 86_400, 2)
-        known["champion"] = {"version": champion.number, "age_days": age_days, "bundle": champion.digest}
+        entry["champion"] = {"version": champion.number, "age_days": age_days, "bundle": champion.digest}
         # Cells run the champion, so its data are what may be stale; a version registered by hand tells none.
         tags = {name.removeprefix(DATA_FACT): tag for name, tag in champion.tags.items() if name.startswith(DATA_FACT)}
-        trained_with = trained_with if champion.digest == known["bundle"] else tags or None
-    known["stale"] = None if trained_with is None else stale_splits(trained_with, job, root)
-    known["failed"] = f"{answers['failed']}: {answers['sentence']}" if answers.get("failed") else None
-    return known
+        trained_with = trained_with if champion.digest == entry["bundle"] else tags or None
+    entry["stale"] = None if trained_with is None else stale_splits(trained_with, job, root)
+    entry["failed"] = f"{answers['failed']}: {answers['sentence']}" if answers.get("failed") else None
+    return entry
 
 
 def stale_splits(trained_with: Mapping[str, str], job: TrainingJob, root: Path) -> list[str]:
@@ -90,32 +90,32 @@ def _standing(store: str | None, name: str) -> Standing | None:
         return None
 
 
-def cells(known: Mapping[str, Any]) -> list[str]:
+def cells(entry: Mapping[str, Any]) -> list[str]:
     """A row as texts, in the order of the table's columns."""
-    champion, sure = known["champion"], known["intervals"]["ap_10"]
+    champion, sure = entry["champion"], entry["intervals"]["ap_10"]
     if champion is None:
-        told = "none"
+        version_text = "none"
     else:
-        other = "" if champion["bundle"] == known["bundle"] else ", another bundle"
+        other = "" if champion["bundle"] == entry["bundle"] else ", another bundle"
         age = "moved by hand" if champion["age_days"] is None else f"{champion['age_days']:.0f} d"
-        told = f"version {champion['version']}, {age}{other}"
-    figures = [known[name] for name in ("ap_10", "ap_5", "ap_2")]
+        version_text = f"version {champion['version']}, {age}{other}"
+    figures = [entry[name] for name in ("ap_10", "ap_5", "ap_2")]
     return [
-        known["object"],
+        entry["object"],
         *("" if value is None else f"{value:.3f}" for value in figures),
         "" if sure is None else f"{sure[0]:.3f} to {sure[1]:.3f}",
-        "" if known["latency_p50_ms"] is None else f"{known['latency_p50_ms']:.0f} ms",
-        told,
-        "" if known["stale"] is None else ", ".join(known["stale"]) or "no",
-        known["failed"] or "done",
+        "" if entry["latency_p50_ms"] is None else f"{entry['latency_p50_ms']:.0f} ms",
+        version_text,
+        "" if entry["stale"] is None else ", ".join(entry["stale"]) or "no",
+        entry["failed"] or "done",
     ]
 
 
 def best_first(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Parts by AP at 2 %, then 5 %, then 10 % D; those without figures last."""
 
-    def order(known: Mapping[str, Any]) -> tuple[float, ...]:
-        return tuple(-1.0 if known[name] is None else known[name] for name in ("ap_2", "ap_5", "ap_10"))
+    def order(entry: Mapping[str, Any]) -> tuple[float, ...]:
+        return tuple(-1.0 if entry[name] is None else entry[name] for name in ("ap_2", "ap_5", "ap_10"))
 
     return sorted(rows, key=order, reverse=True)
 
@@ -128,18 +128,18 @@ def show(rows: Sequence[Mapping[str, Any]]) -> None:
     table = Table(title=f"{len(rows)} parts", title_justify="left", box=None, pad_edge=False)
     for name in _HEAD:
         table.add_column(name, overflow="fold")
-    for known in rows:
-        table.add_row(*cells(known))
+    for entry in rows:
+        table.add_row(*cells(entry))
     Console(stderr=True).print(table)
 
 
 def write(folder: Path, rows: Sequence[dict[str, Any]], left_out: Mapping[str, str]) -> Path:
     """leaderboard.md and leaderboard.json; the path of the first."""
     lines = ["# Fleet", "", f"| {' | '.join(_HEAD)} |", f"|{'---|' * len(_HEAD)}"]
-    lines += [f"| {' | '.join(cell.replace('|', '/') for cell in cells(known))} |" for known in rows]
+    lines += [f"| {' | '.join(cell.replace('|', '/') for cell in cells(entry))} |" for entry in rows]
     if left_out:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in left_out.items())]
-    place = folder / "leaderboard.md"
-    write_whole(place, "\n".join(lines) + "\n")
+    path = folder / "leaderboard.md"
+    write_whole(path, "\n".join(lines) + "\n")
     write_json(folder / "leaderboard.json", {"members": list(rows), "left_out": dict(left_out)})
-    return place
+    return path

@@ -51,9 +51,9 @@ def run(cfg: FleetSettings, words: Sequence[str]) -> dict[str, Any]:
     threads = cores_of_a_job(cfg.threads, cfg.executor, workers)
     folder = Path(cfg.fleets)
     here = cfg.executor == "local" and workers == 1
-    own = () if here else (f"workers={threads}", f"trainer.threads={threads}")
+    core_words = () if here else (f"workers={threads}", f"trainer.threads={threads}")
     # The user's words come last: a number of threads that was asked for is kept.
-    member_words, places = words_of_verbs(cfg, (*own, *training), next(iter(jobs)))
+    member_words, places = words_of_verbs(cfg, (*core_words, *training), next(iter(jobs)))
     task = MemberTask(member_words, None if here else folder / "logs", environment=handed_on())
     with locked_folder(folder, cfg.fleets, "fleet", "fleets"):
         answers = _run(task, list(jobs), executor, workers, cfg.retries, threads)
@@ -64,7 +64,7 @@ def run(cfg: FleetSettings, words: Sequence[str]) -> dict[str, Any]:
         rows = fleet_board.best_first(rows)
         board = fleet_board.write(folder, rows, left_out)
     fleet_board.show(rows)
-    failures = {known["object"]: known["failed"] for known in rows if known["failed"]}
+    failures = {row["object"]: row["failed"] for row in rows if row["failed"]}
     log.info("%d of %d parts are done: %s", len(rows) - len(failures), len(rows), board)
     result = {
         "stage": "fleet",
@@ -74,8 +74,8 @@ def run(cfg: FleetSettings, words: Sequence[str]) -> dict[str, Any]:
         "leaderboard": str(board),
     }
     if failures:
-        told = "; ".join(f"{name} failed, {reason}" for name, reason in failures.items())
-        raise Refused(f"{len(failures)} of {len(rows)} parts are not done: {told}", result)
+        reasons = "; ".join(f"{name} failed, {reason}" for name, reason in failures.items())
+        raise Refused(f"{len(failures)} of {len(rows)} parts are not done: {reasons}", result)
     return result
 
 
@@ -98,13 +98,13 @@ def members(objects: str, training: Sequence[str]) -> tuple[dict[str, TrainingJo
     """
     from attentionvote.workflows.train.job import find_training
 
-    known = choices("object")
+    valid = choices("object")
     everything = objects == "all"
-    named = known if everything else [name.strip() for name in objects.split(",") if name.strip()]
+    named = valid if everything else [name.strip() for name in objects.split(",") if name.strip()]
     for name in named:
-        if name not in known:
+        if name not in valid:
             raise ConfigurationError(
-                f"objects must be all or among {', '.join(known)}; got {name!r}{nearest(name, known)}"
+                f"objects must be all or among {', '.join(valid)}; got {name!r}{nearest(name, valid)}"
             )
     jobs: dict[str, TrainingJob] = {}
     left_out: dict[str, str] = {}
@@ -137,9 +137,9 @@ def _run(
             with closing(run_all(task, left, executor, workers=workers, retries=retries, threads=threads)) as results:
                 for index, answer in results:
                     answers[left[index]] = answer
-                    told = f"failed, {answer['sentence']}" if answer.get("failed") else "done"
+                    ending = f"failed, {answer['sentence']}" if answer.get("failed") else "done"
                     log.info(
-                        "%s (%d of %d): %s, %.0f s", left[index], len(answers), len(names), told, answer["seconds"]
+                        "%s (%d of %d): %s, %.0f s", left[index], len(answers), len(names), ending, answer["seconds"]
                     )
         except WorkerDied as error:
             name = left[error.job]

@@ -59,7 +59,7 @@ def scored(cfg: ScoreSettings) -> dict[str, Any]:
             "not looked at: %d results beyond %d an image, %d of objects not in the image, %d outside the targets",
             scores.beyond_limit, limit, scores.elsewhere, outside,
         )  # fmt: skip
-    per_object = {str(number): asdict(found) for number, found in scores.per_object.items()}
+    per_object = {str(number): asdict(object_scores) for number, object_scores in scores.per_object.items()}
     return {
         "format": "bop",
         "method": name.method,
@@ -68,8 +68,8 @@ def scored(cfg: ScoreSettings) -> dict[str, Any]:
         "bop25_mAP_mm": scores.map_mm,
         "seconds_per_image": seconds,
         "images": scores.images,
-        "targets": sum(found.targets for found in scores.per_object.values()),
-        "estimates": sum(found.estimates for found in scores.per_object.values()),
+        "targets": sum(object_scores.targets for object_scores in scores.per_object.values()),
+        "estimates": sum(object_scores.estimates for object_scores in scores.per_object.values()),
         "beyond_limit": scores.beyond_limit,
         "elsewhere": scores.elsewhere,
         "outside_targets": outside,

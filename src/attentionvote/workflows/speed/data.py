@@ -38,7 +38,10 @@ def slowly(call: Callable[[], Result]) -> Callable[[], Result]:
 
 def tensors(batch: Batch) -> list[Any]:
     """All arrays of a sample or batch."""
-    return [np.asarray(value) for value in (*batch[:3], *batch[4:], batch.found.order, *sum(batch.found[1:], ()))]
+    return [
+        np.asarray(value)
+        for value in (*batch[:3], *batch[4:], batch.neighborhoods.order, *sum(batch.neighborhoods[1:], ()))
+    ]
 
 
 def new_sample(material: Material, size: str) -> Contest:

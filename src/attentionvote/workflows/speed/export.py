@@ -40,7 +40,7 @@ def graph(material: Material, size: str) -> Contest:
     def eager(found: bool) -> Callable[[], Predictions]:
         def run() -> Predictions:
             with torch.no_grad():
-                answer: Predictions = model(batch.points, batch.normals, batch.found if found else None)
+                answer: Predictions = model(batch.points, batch.normals, batch.neighborhoods if found else None)
             return answer
 
         return run
@@ -49,11 +49,13 @@ def graph(material: Material, size: str) -> Contest:
         points, layout = batch.points[0], model.layout
         below, neighbors = points, []
         for size, count, radius in zip(layout.centers, layout.neighbors, layout.radii, strict=True):
-            centers = points[batch.found.order[0, :size]]
+            centers = points[batch.neighborhoods.order[0, :size]]
             neighbors.append(cdist_query(below, centers, radius, count)[None])
             below = centers
         with torch.no_grad():
-            answer: Predictions = model(batch.points, batch.normals, batch.found._replace(neighbors=tuple(neighbors)))
+            answer: Predictions = model(
+                batch.points, batch.normals, batch.neighborhoods._replace(neighbors=tuple(neighbors))
+            )
         return answer
 
     def in_a_cell() -> dict[str, NDArray]:

@@ -25,9 +25,9 @@ def training(material: Material, device: str = "cuda") -> Contest:
     _need(device)
     cfg = material.trainings["full"]
     batch = material.batch("full", 1)
-    one = batch.to(device)
+    device_batch = batch.to(device)
     scenes = SCENES if device == "cuda" else 2
-    whole = type(one)(*(_repeated(value, scenes) for value in one))
+    whole = type(device_batch)(*(_repeated(value, scenes) for value in device_batch))
     model = copy.deepcopy(material.network("full")).to(device).train()
     loss = AttentionVoteLoss(material.part, asdict(cfg.loss.weights), cfg.loss.settings)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0, foreach=True)
@@ -92,5 +92,5 @@ def _repeated(value: Any, times: int) -> Any:
     """A batch of one, several times."""
     if isinstance(value, torch.Tensor):
         return value.repeat(times, *[1] * (value.dim() - 1))
-    kept = [_repeated(item, times) for item in value]
-    return type(value)(*kept) if hasattr(value, "_fields") else tuple(kept)
+    repeated_items = [_repeated(item, times) for item in value]
+    return type(value)(*repeated_items) if hasattr(value, "_fields") else tuple(repeated_items)

@@ -79,7 +79,7 @@ def proposals(material: Material) -> Contest:
 
         def run() -> bool:
             with torch.no_grad():
-                answer = own(batch.points, batch.normals, batch.found)
+                answer = own(batch.points, batch.normals, batch.neighborhoods)
             return answer.center.shape[1] == k and bool(torch.isfinite(answer.center).all())
 
         return run

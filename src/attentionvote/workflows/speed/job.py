@@ -13,7 +13,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.entry import configuring
 from attentionvote.command.errors import Refused, sentence
 from attentionvote.workflows.speed.contest import NotMeasured, Row, Unequal, measure
-from attentionvote.workflows.speed.rows import ROWS, chosen
+from attentionvote.workflows.speed.rows import ROWS, select_rows
 from attentionvote.workflows.speed.settings import SpeedSettings
 from attentionvote.workflows.train.settings import TrainSettings
 
@@ -27,24 +27,24 @@ log = logging.getLogger("attentionvote.bench")
 def run(cfg: SpeedSettings) -> dict[str, Any]:
     """Measure the chosen rows, show them, and write them down."""
     from attentionvote.workflows.page_sections import put
-    from attentionvote.workflows.speed.report import COMMAND, SECTION, keep, kept_rows, markdown, run_facts, show
+    from attentionvote.workflows.speed.report import COMMAND, SECTION, keep, markdown, run_facts, show, stored_rows
 
     with configuring():
-        rows, material = chosen(cfg.rows), _material(cfg)
-        earlier = kept_rows(Path(cfg.page)) if cfg.page else {}
+        rows, material = select_rows(cfg.rows), _material(cfg)
+        earlier = stored_rows(Path(cfg.page)) if cfg.page else {}
     facts = run_facts(cfg.seed, cfg.rounds)
     with material:
-        found, failures = measured(rows, material, cfg.rounds)
-    done = {name: {**row, "run": facts} for name, row in found.items()}
+        rows_done, failures = measured(rows, material, cfg.rounds)
+    done = {name: {**row, "run": facts} for name, row in rows_done.items()}
     names = [row.name for row in ROWS]
     show(names, done)
     if cfg.page:
         page = Path(cfg.page)
-        known = {name: row for name, row in earlier.items() if name not in failures} | done
-        keep(page, known)
-        put(page, SECTION, markdown(names, known), COMMAND)
+        shown_rows = {name: row for name, row in earlier.items() if name not in failures} | done
+        keep(page, shown_rows)
+        put(page, SECTION, markdown(names, shown_rows), COMMAND)
         log.info("written into %s", page)
-    result = {"stage": "bench", **facts, "rows": list(found.values()), "failures": failures, "page": cfg.page}
+    result = {"stage": "bench", **facts, "rows": list(rows_done.values()), "failures": failures, "page": cfg.page}
     if failures:
         name, reason = next(iter(failures.items()))
         raise Refused(f"{len(failures)} rows failed (first: {name}: {reason})", result)
@@ -56,7 +56,7 @@ def measured(rows: Sequence[Row], material: Material, rounds: int) -> tuple[dict
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    found: dict[str, dict[str, Any]] = {}
+    rows_done: dict[str, dict[str, Any]] = {}
     failures: dict[str, str] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
@@ -64,10 +64,10 @@ def measured(rows: Sequence[Row], material: Material, rounds: int) -> tuple[dict
         for index, row in enumerate(rows):
             bar.update(task, description=f"{row.name}: preparing", completed=index * rounds)
             try:
-                found[row.name] = _measured(row, material, rounds, lambda: bar.advance(task))
+                rows_done[row.name] = _measured(row, material, rounds, lambda: bar.advance(task))
             except NotMeasured as error:
                 goals = [{"text": goal.text, "met": None} for goal in row.goals]
-                found[row.name] = {
+                rows_done[row.name] = {
                     "row": row.name,
                     "title": row.title,
                     "reason": str(error),
@@ -77,7 +77,7 @@ def measured(rows: Sequence[Row], material: Material, rounds: int) -> tuple[dict
             except Unequal as error:
                 failures[row.name] = sentence(error)
                 log.error("%s: %s", row.name, sentence(error))
-    return found, failures
+    return rows_done, failures
 
 
 def _measured(row: Row, material: Material, rounds: int, progress: Any) -> dict[str, Any]:

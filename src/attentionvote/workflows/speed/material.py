@@ -85,12 +85,12 @@ class Material:
         """
         last = replace(self.cycle, drop_counts=self.cycle.drop_counts[-1:])
         self._scenes = generate_scene_set(self.part, last, self.folder / "scenes", progress=False)
-        found = list(self._scenes.records)
-        if not found:
+        records = list(self._scenes.records)
+        if not records:
             raise ValueError(
                 f"a bin must hold {last.drop_counts[-1]} parts of {self.part.name}, got fewer: choose another"
             )
-        return found
+        return records
 
     @property
     def record(self) -> SceneRecord:
@@ -128,7 +128,7 @@ class Material:
         from attentionvote.model.network import AttentionVote
 
         torch.manual_seed(self.seed)
-        model: AttentionVote = AttentionVote(**network_arguments(self.trainings[size].model, self.part))
+        model = AttentionVote.from_arguments(network_arguments(self.trainings[size].model, self.part))
         return model.eval()
 
     def batch(self, size: str, scenes: int | None = None) -> Batch:

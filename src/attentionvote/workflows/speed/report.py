@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from attentionvote.files import write_json
-from attentionvote.workflows.page_sections import kept_beside, record_of
+from attentionvote.workflows.page_sections import record_of, stored_beside
 
 SECTION = "speed"
 COMMAND = "make bench"
@@ -35,13 +35,13 @@ def run_facts(seed: int, rounds: int) -> dict[str, Any]:
     }
 
 
-def kept_rows(page: Path) -> dict[str, dict[str, Any]]:
+def stored_rows(page: Path) -> dict[str, dict[str, Any]]:
     """The rows of earlier calls, which the page goes on to show.
 
     Raises:
         ValueError: when their file is damaged.
     """
-    return dict(kept_beside(page, SECTION, "rows", COMMAND) or {})
+    return dict(stored_beside(page, SECTION, "rows", COMMAND) or {})
 
 
 def keep(page: Path, rows: Rows) -> None:
@@ -93,7 +93,9 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     """What, of, ours, beside it, to reach, verdict, equal."""
     if "reason" in row:
         return [row["title"], "", f"not measured: {row['reason']}", "", _goals(row), "", ""]
-    beside = [f"{name} {_ms(one['ms'])} ({one['factor']:.3g} x)" for name, one in row["references"].items()]
+    beside = [
+        f"{name} {_ms(reference['ms'])} ({reference['factor']:.3g} x)" for name, reference in row["references"].items()
+    ]
     beside += [f"{name} not installed" for name in row["absent"]]
     ours = f"{_ms(row['ms'])} a {row['item']} ({row['clock']})"
     return [row["title"], row["size"], ours, "; ".join(beside), _goals(row), _MET[row["met"]], row["equal"]]

@@ -134,7 +134,7 @@ ROWS: tuple[Row, ...] = (
 )
 
 
-def chosen(names: str | None) -> list[Row]:
+def select_rows(names: str | None) -> list[Row]:
     """The rows of a list of names with commas between them, in the table's order; all without one.
 
     Raises:
@@ -143,9 +143,9 @@ def chosen(names: str | None) -> list[Row]:
     if names is None:
         return list(ROWS)
     wanted = [name.strip() for name in names.split(",")]
-    known = [row.name for row in ROWS]
+    valid = [row.name for row in ROWS]
     for name in wanted:
-        if name not in known:
-            near = get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            raise ValueError(f"rows must be among {', '.join(known)}; got {name!r}, did you mean {near!r}?")
+        if name not in valid:
+            near = get_close_matches(name, valid, n=1, cutoff=0.0)[0]
+            raise ValueError(f"rows must be among {', '.join(valid)}; got {name!r}, did you mean {near!r}?")
     return [row for row in ROWS if row.name in wanted]

@@ -66,9 +66,9 @@ def expectations(bundle_folder: Path, key: Path) -> list[Expected]:
         expected = []
         for cloud in bundle.golden():
             answer = estimator.estimate(cloud.points)
-            found = answer.detections if isinstance(answer, Estimate) else ()
-            poses = np.array([d.camera_from_part for d in found], np.float64).reshape(-1, 4, 4)
-            expected.append(Expected(cloud.points, poses, np.array([d.confidence for d in found], np.float32)))
+            detections = answer.detections if isinstance(answer, Estimate) else ()
+            poses = np.array([d.camera_from_part for d in detections], np.float64).reshape(-1, 4, 4)
+            expected.append(Expected(cloud.points, poses, np.array([d.confidence for d in detections], np.float32)))
     return expected
 
 

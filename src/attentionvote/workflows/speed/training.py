@@ -63,9 +63,9 @@ def set_abstraction(material: Material) -> Contest:
     widths = [bias.shape[0] for bias in list(layer.weights)[1::2]]
     usual = ConvAbstraction(CHANNELS, widths)
     rows = torch.arange(len(batch.points))[:, None]
-    order = batch.found.order[:, : layout.centers[0]]
+    order = batch.neighborhoods.order[:, : layout.centers[0]]
     centers, center_normals = batch.points[rows, order], batch.normals[rows, order]
-    neighbors = batch.found.neighbors[0]
+    neighbors = batch.neighborhoods.neighbors[0]
     direction = torch.randn(*centers.shape[:2], widths[-1], generator=torch.Generator().manual_seed(material.seed))
 
     def fast() -> Answer:

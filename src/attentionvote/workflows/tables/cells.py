@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from attentionvote.part import Part
 
 log = logging.getLogger("attentionvote.benchmark")
-_KEPT = (
+_CELL_KEYS = (
     "figures",
     "intervals",
     "thresholds",
@@ -65,7 +65,7 @@ def network_cell(
     if answers.get("failed"):
         raise CellFailed(f"{answers['failed']} failed, {answers['sentence']}")
     trained, evaluated = answers["train"], answers["evaluate"]
-    return {key: evaluated[key] for key in _KEPT} | {
+    return {key: evaluated[key] for key in _CELL_KEYS} | {
         "budget": {
             "steps": trained["steps"],
             "train_seconds": trained["train_seconds"],
@@ -89,15 +89,15 @@ def cells_of_parts(cell: Mapping[str, Any] | None, parts: Sequence[str]) -> dict
 
 def _cell_of_part(cell: Mapping[str, Any], part: str) -> dict[str, Any]:
     begin = f"{part}/"
-    own = {
+    part_figures = {
         kind: {name.removeprefix(begin): value for name, value in cell[kind].items() if name.startswith(begin)}
         for kind in ("figures", "intervals")
     }
-    if not own["figures"]:
+    if not part_figures["figures"]:
         raise CellFailed(f"the bin must hold the part {part}, got none")
     times = {name: value for name, value in cell["figures"].items() if name.startswith("latency_")}
     shared = {key: value for key, value in cell.items() if key not in ("thresholds", "ap_by_threshold")}
-    return shared | own | {"figures": own["figures"] | times}
+    return shared | part_figures | {"figures": part_figures["figures"] | times}
 
 
 def baseline_cell(
@@ -132,19 +132,19 @@ def baseline_cell(
     frozen = scenes_of(cfg, part)
     what = [asdict(settings), frozen.digest, part.digest, package_version("opencv-contrib-python-headless")]
     key = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-    place = folder / row.detector / f"{name}-{key[:12]}.json"
-    known = read_json(place)
-    if known is not None and not cfg.force:
-        return known | {"frozen": is_recorded(cfg, part, frozen)}
+    path = folder / row.detector / f"{name}-{key[:12]}.json"
+    stored = read_json(path)
+    if stored is not None and not cfg.force:
+        return stored | {"frozen": is_recorded(cfg, part, frozen)}
     validation = generated_set(cfg, part, set_spec(cfg, part, "val", 1))
     log.info("%s, %s: %d scenes, and %d for its working point", row.name, name, len(frozen), len(validation))
-    found = []
+    measured_sets = []
     for scenes in (validation, frozen):
         clouds = list(_shown(scenes.clouds(), f"{name}: clouds", len(scenes)))
-        bar = partial(_shown, told=f"{row.name}, {name}", total=len(clouds))
-        found.append(ppf_results(part, clouds, settings, workers, shown=bar))
-    (chosen, _), (results, seconds) = found
-    measured = Measurement(row.detector, results, best_threshold(chosen, part), seconds)
+        bar = partial(_shown, title=f"{row.name}, {name}", total=len(clouds))
+        measured_sets.append(ppf_results(part, clouds, settings, workers, shown=bar))
+    (validation_results, _), (results, seconds) = measured_sets
+    measured = Measurement(row.detector, results, best_threshold(validation_results, part), seconds)
     cell = figures_of(measured, part) | {
         "scenes": len(frozen),
         "evaluation_set": frozen.digest,
@@ -155,13 +155,13 @@ def baseline_cell(
         "seed": cfg.simulation.seed,
         "commit": git_state(Path.cwd()).label,
     }
-    place.parent.mkdir(parents=True, exist_ok=True)
-    write_json(place, cell)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, cell)
     return cell
 
 
-def _shown(items: Iterator[Any], told: str, total: int) -> Iterable[Any]:
+def _shown(items: Iterator[Any], title: str, total: int) -> Iterable[Any]:
     from rich.console import Console
     from rich.progress import track
 
-    return track(items, told, total, console=Console(stderr=True))
+    return track(items, title, total, console=Console(stderr=True))

@@ -48,13 +48,13 @@ def run(cfg: TablesSettings, words: Sequence[str]) -> dict[str, Any]:
 
     with configuring():
         table = BenchmarkTable.of(table_name(words), cfg.composed["table"])
-        objects, rows = table.chosen(cfg.objects, cfg.rows)
+        objects, rows = table.select(cfg.objects, cfg.rows)
     if cfg.record:
         return record(cfg, [*objects, *(row.together for row in rows if row.together)])
     folder = Path(cfg.benchmarks)
     with locked_folder(folder, cfg.benchmarks, "benchmark", "benchmarks"):
         with configuring():
-            kept = BenchmarkRecord.beside(cfg.page, table.name)
+            page_record = BenchmarkRecord.beside(cfg.page, table.name)
         failures: dict[str, str] = {}
         left_out: dict[str, str] = {}
         for row in rows:
@@ -71,19 +71,19 @@ def run(cfg: TablesSettings, words: Sequence[str]) -> dict[str, Any]:
                     continue
                 for part, measured in shown.items():
                     if measured is not None:
-                        kept.add(row.name, part, measured)
+                        page_record.add(row.name, part, measured)
                 if cell is None:
                     log.info("%s, %s: not run (train=true trains it)", row.name, name)
         if cfg.page:
             page = Path(cfg.page)
             picture = f"{IMAGES}/{table.name}.png"
-            drawn = table.curve is not None and draw(table, table.curve, kept.cells, page.parent / picture)
-            put(page, table.name, markdown(table, kept.cells, picture if drawn else None))
+            drawn = table.curve is not None and draw(table, table.curve, page_record.cells, page.parent / picture)
+            put(page, table.name, markdown(table, page_record.cells, picture if drawn else None))
             log.info("%s: written into %s", table.title, page)
     result = {
         "stage": "benchmark",
         "table": table.name,
-        "cells": list(kept.cells.values()),
+        "cells": list(page_record.cells.values()),
         "failures": failures,
         "left_out": left_out,
         "page": cfg.page,
@@ -98,20 +98,20 @@ def _measure(cfg: TablesSettings, words: Sequence[str], row: Row, name: str) -> 
     from attentionvote.execution.hardware import cores
     from attentionvote.workflows.tables.cells import baseline_cell, network_cell
 
-    own = Path(cfg.benchmarks)
+    folder = Path(cfg.benchmarks)
     part = words_of(("object",), words)
     # What a benchmark exports is nobody's newest model.
     here = replace(
         cfg,
-        export=(f"outputs={own / 'export'}", *part, *cfg.export, *row.export),
-        evaluate=(f"outputs={own / 'evaluate'}", *part, *scene_words(words), *cfg.evaluate, *row.evaluate),
+        export=(f"outputs={folder / 'export'}", *part, *cfg.export, *row.export),
+        evaluate=(f"outputs={folder / 'evaluate'}", *part, *scene_words(words), *cfg.evaluate, *row.evaluate),
     )
     if row.detector == "network":
         verbs, _ = words_of_verbs(here, [*training_words(words, cfg.train), *row.train], name)
         return network_cell(verbs, name, cfg.train)
     # Where bundles lie and who signed them is nothing to the baseline.
     on = [f"root={cfg.root}", *here.evaluate, *(["force=true"] if cfg.force else [])]
-    return baseline_cell(on, name, row, own, cfg.baseline_workers or cores(), cfg.composed["ppf"])
+    return baseline_cell(on, name, row, folder, cfg.baseline_workers or cores(), cfg.composed["ppf"])
 
 
 def record(cfg: TablesSettings, objects: Sequence[str]) -> dict[str, Any]:
@@ -122,14 +122,16 @@ def record(cfg: TablesSettings, objects: Sequence[str]) -> dict[str, Any]:
     content = yaml.safe_load(RECORDED.read_text(encoding="utf-8"))
     frozen = dict(content.get("frozen", {}))
     for name in objects:
-        own = compose(EvaluateSettings, [f"object={name}", f"root={cfg.root}", "evaluation=benchmark", *cfg.evaluate])
+        evaluation = compose(
+            EvaluateSettings, [f"object={name}", f"root={cfg.root}", "evaluation=benchmark", *cfg.evaluate]
+        )
         try:
             with configuring():
-                part = own.object()
+                part = evaluation.object()
         except ConfigurationError as error:
             log.warning("%s: %s", name, error)
             continue
-        frozen[name] = generated_set(own, part, set_spec(own, part)).scenes.digest
+        frozen[name] = generated_set(evaluation, part, set_spec(evaluation, part)).scenes.digest
     head = "".join(line for line in RECORDED.read_text().splitlines(True) if line.startswith("#"))
     content["frozen"] = dict(sorted(frozen.items()))
     write_whole(RECORDED, head + yaml.safe_dump(content, sort_keys=False))
@@ -153,11 +155,11 @@ def training_words(words: Sequence[str], train: bool) -> list[str]:
     """
     if "object" in [str(override.key_or_group) for override in parse(words)]:
         raise ConfigurationError("a benchmark takes objects=NAME,NAME, got object=: say OBJECTS=...")
-    kept = words_beside("benchmark", ("table", "evaluation"), words)
-    return kept if train else [*kept, "force=false"]
+    handed_on = words_beside("benchmark", ("table", "evaluation"), words)
+    return handed_on if train else [*handed_on, "force=false"]
 
 
 def scene_words(words: Sequence[str]) -> list[str]:
     """The words that are about the scenes; the frozen ones unless others are named."""
-    chosen = any(str(override.key_or_group) == "evaluation" for override in parse(words))
-    return [*([] if chosen else ["evaluation=benchmark"]), *words_of(("evaluation",), words)]
+    named = any(str(override.key_or_group) == "evaluation" for override in parse(words))
+    return [*([] if named else ["evaluation=benchmark"]), *words_of(("evaluation",), words)]

@@ -32,15 +32,20 @@ def markdown(table: BenchmarkTable, cells: Cells, picture: str | None) -> str:
     ]
     for figure in table.figures:
         of = f", {title_of(figure)}" if len(table.figures) > 1 else ""
-        for told in table.paper:
-            if told.figure == figure:
+        for paper_row in table.paper:
+            if paper_row.figure == figure:
                 lines.append(
-                    _line(f"paper: {told.method}{of}", [_number(v) for v in told.values], told.values, several)
+                    _line(
+                        f"paper: {paper_row.method}{of}",
+                        [_number(v) for v in paper_row.values],
+                        paper_row.values,
+                        several,
+                    )
                 )
         for row in table.measured:
-            known = [cells.get((row.name, name)) for name in objects]
-            values = [None if cell is None else cell["figures"].get(figure) for cell in known]
-            texts = [NOT_RUN if cell is None else _number(v) for cell, v in zip(known, values, strict=True)]
+            row_cells = [cells.get((row.name, name)) for name in objects]
+            values = [None if cell is None else cell["figures"].get(figure) for cell in row_cells]
+            texts = [NOT_RUN if cell is None else _number(v) for cell, v in zip(row_cells, values, strict=True)]
             if any(text != NOT_RUN for text in texts):
                 lines.append(_line(f"**{row.name}**{of}", texts, values, several))
             else:
@@ -109,12 +114,12 @@ def draw(table: BenchmarkTable, curve: Curve, cells: Cells, path: Path) -> bool:
 
 def _draw_rows(axes: Any, curve: Curve, table: BenchmarkTable, cells: Cells, name: str) -> None:
     """The curves of one object: one a row, or, where a row is a point, one of all rows."""
-    known = [(row, cells[row.name, name]) for row in table.measured if (row.name, name) in cells]
+    measured = [(row, cells[row.name, name]) for row in table.measured if (row.name, name) in cells]
     label = name.replace("_", " ")
     if curve.figure in table.figures:
-        points = [(float(row.name), cell["figures"][curve.figure]) for row, cell in known]
+        points = [(float(row.name), cell["figures"][curve.figure]) for row, cell in measured]
         if points:
             axes.plot(*zip(*points, strict=True), marker="o", label=label)
         return
-    for row, cell in known:
+    for row, cell in measured:
         axes.plot(cell["thresholds"], cell[curve.figure], label=f"{label}, {row.name}")

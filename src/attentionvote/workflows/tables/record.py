@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from attentionvote.files import write_json
-from attentionvote.workflows.page_sections import kept_beside, record_of
+from attentionvote.workflows.page_sections import record_of, stored_beside
 
 
 @dataclass
@@ -22,7 +22,7 @@ class BenchmarkRecord:
     """
 
     table: str
-    place: Path | None
+    path: Path | None
     cells: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
 
     @classmethod
@@ -34,11 +34,11 @@ class BenchmarkRecord:
         """
         if not page:
             return cls(table, None)
-        cells = kept_beside(Path(page), table, "cells") or []
+        cells = stored_beside(Path(page), table, "cells") or []
         return cls(table, record_of(Path(page), table), {(cell["row"], cell["object"]): cell for cell in cells})
 
     def add(self, row: str, name: str, cell: Mapping[str, Any]) -> None:
         """Keep a cell, in place of what was there."""
         self.cells[row, name] = {"row": row, "object": name, **cell}
-        if self.place is not None:
-            write_json(self.place, {"table": self.table, "cells": list(self.cells.values())})
+        if self.path is not None:
+            write_json(self.path, {"table": self.table, "cells": list(self.cells.values())})

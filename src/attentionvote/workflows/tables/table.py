@@ -94,7 +94,7 @@ class BenchmarkTable:
         figures, objects = tuple(content["figures"]), tuple(content["objects"])
         return cls(name, content["title"], figures, objects, tuple(rows), tuple(paper), curve)
 
-    def chosen(self, objects: str | None, rows: str | None) -> tuple[tuple[str, ...], tuple[Row, ...]]:
+    def select(self, objects: str | None, rows: str | None) -> tuple[tuple[str, ...], tuple[Row, ...]]:
         """Objects and rows that are named, all by default.
 
         Raises:
@@ -109,8 +109,8 @@ class BenchmarkTable:
             if name not in [row.name for row in self.measured]:
                 have = ", ".join(row.name for row in self.measured)
                 raise ValueError(f"rows must be among those of {self.name}, {have}; got {name!r}")
-        kept = [row for row in self.measured if not wanted or row.name in wanted]
-        return tuple(named), tuple(kept)
+        selected = [row for row in self.measured if not wanted or row.name in wanted]
+        return tuple(named), tuple(selected)
 
 
 def title_of(figure: str) -> str:
@@ -121,8 +121,8 @@ def title_of(figure: str) -> str:
 
 def mean(values: Sequence[float | None]) -> float | None:
     """The mean of all, None when one is missing."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if len(known) == len(values) and known else None
+    present = [value for value in values if value is not None]
+    return sum(present) / len(present) if len(present) == len(values) and present else None
 
 
 def _list(words: str | None) -> list[str]:

@@ -13,14 +13,19 @@ from attentionvote.data.sensing import CloudSettings
 from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import scene_set_directory
 from attentionvote.workflows.train.job import TrainingJob
-from attentionvote.workflows.train.processes import FirstDoes, Place
+from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
 from attentionvote.workflows.train.settings import TrainSettings
 
 _CYCLES_PER_PROCESS = 5
 
 
 def prepare_data(
-    cfg: TrainSettings, job: TrainingJob, settings: CloudSettings, workers: int, place: Place, first_does: FirstDoes
+    cfg: TrainSettings,
+    job: TrainingJob,
+    settings: CloudSettings,
+    workers: int,
+    process: TrainingProcess,
+    first_does: FirstDoes,
 ) -> tuple[dict[str, Clouds], dict[str, str]]:
     """Generate and measure what is missing, or measure a dataset, in the first process; open it in all.
 
@@ -49,28 +54,28 @@ def prepare_data(
             made[split] = clouds, scenes, directory
         return {split: [str(d), str(c.directory), s.digest] for split, (c, s, d) in made.items()}
 
-    found = first_does("data", make)
-    digests = {split: digest for split, (*_, digest) in found.items()}
+    locations = first_does("data", make)
+    digests = {split: digest for split, (*_, digest) in locations.items()}
     if made:
         return {split: clouds for split, (clouds, *_) in made.items()}, digests
     read_here = job.dataset.splits if job.dataset else {}
-    return {split: _open(cfg, place, read_here.get(split), *where) for split, where in found.items()}, digests
+    return {split: _open(cfg, process, read_here.get(split), *where) for split, where in locations.items()}, digests
 
 
 def _open(
-    cfg: TrainSettings, place: Place, read_here: DatasetSplit | None, scenes: str, clouds: str, digest: str
+    cfg: TrainSettings, process: TrainingProcess, read_here: DatasetSplit | None, scenes: str, clouds: str, digest: str
 ) -> Clouds:
     unseen = [path for path in (scenes, clouds) if not Path(path).is_dir()]
     if unseen:
         raise ValueError(
-            f"root={cfg.root} must be a folder that all processes share, but {place.name} on {socket.gethostname()} "
+            f"root={cfg.root} must be a folder that all processes share, but {process.name} on {socket.gethostname()} "
             f"does not find {unseen[0]}"
         )
     opened = read_here or SceneSet.open(Path(scenes))
     if opened.digest != digest:
         shared = f"root={cfg.root} and the dataset" if read_here else f"root={cfg.root}"
         raise ValueError(
-            f"{scenes} must hold the same scenes for all processes, but {place.name} on {socket.gethostname()} finds "
+            f"{scenes} must hold the same scenes for all processes, but {process.name} on {socket.gethostname()} finds "
             f"{opened.digest[:12]} instead of {digest[:12]}: share {shared}"
         )
     return Clouds(Path(clouds), opened)

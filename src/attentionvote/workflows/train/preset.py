@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from attentionvote.workflows.train.processes import Place, be_silent, refuse_grid
+from attentionvote.workflows.train.processes import TrainingProcess, be_silent, refuse_grid
 from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
@@ -20,9 +20,9 @@ def preset_of_hardware(words: list[str]) -> list[str]:
 
     Told without importing torch: an NVIDIA driver is loaded, not hidden from us, and torch is no CPU build.
     """
-    place = Place.of(os.environ)
-    refuse_grid(place, sys.argv)
-    if place.local_rank:
+    process = TrainingProcess.of(os.environ)
+    refuse_grid(process, sys.argv)
+    if process.local_rank:
         be_silent()  # what is wrong with the words is said once a machine
     if any(word.lstrip("+~").startswith("experiment") for word in words):
         return []
@@ -33,7 +33,7 @@ def preset_of_hardware(words: list[str]) -> list[str]:
             preset, reason = "compact", "CUDA_VISIBLE_DEVICES hides the GPU"
         elif version("torch").endswith("+cpu"):
             preset, reason = "compact", "torch is a CPU build"
-    if place.rank == 0:
+    if process.rank == 0:
         log.info("experiment=%s, because %s (experiment=... chooses another)", preset, reason)
     return [f"experiment={preset}"]
 

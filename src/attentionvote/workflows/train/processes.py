@@ -26,7 +26,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
-class Place:
+class TrainingProcess:
     """Where this process stands among those of its training.
 
     Args:
@@ -40,7 +40,7 @@ class Place:
     local_processes: int = 1
 
     @classmethod
-    def of(cls, environment: Mapping[str, str]) -> Place:
+    def of(cls, environment: Mapping[str, str]) -> TrainingProcess:
         """What ``torchrun`` says in the environment; alone without it.
 
         Raises:
@@ -137,7 +137,7 @@ class Place:
 
 
 @contextmanager
-def first_speaks(place: Place) -> Iterator[None]:
+def first_speaks(process: TrainingProcess) -> Iterator[None]:
     """Only the first process writes to stderr; another one only says, in one sentence, why it failed.
 
     That it ends because another one has ended is not said by the others, and by the first in words.
@@ -145,17 +145,17 @@ def first_speaks(place: Place) -> Iterator[None]:
     Raises:
         ConnectionError: instead of what a backend says when another process is gone.
     """
-    if place.rank:
+    if process.rank:
         be_silent()
     try:
         yield
     except ConfigurationError as error:
         # The processes of one machine find the same; those of another one may find something else.
-        if place.local_rank == 0:
-            _say(place, error)
+        if process.local_rank == 0:
+            _say(process, error)
         raise
     except Exception as error:
-        if place.processes == 1:
+        if process.processes == 1:
             raise
         from attentionvote.training.processes import is_echo
 
@@ -163,7 +163,7 @@ def first_speaks(place: Place) -> Iterator[None]:
             raise ConnectionError(
                 "another process of this training has ended; run the same command to resume"
             ) from error
-        _say(place, error)
+        _say(process, error)
         raise
 
 
@@ -173,9 +173,9 @@ def be_silent() -> None:
     logging.disable(logging.CRITICAL)
 
 
-def _say(place: Place, error: BaseException) -> None:
-    if place.rank and sys.__stderr__ is not None:
-        print(f"train: {place.name}: {sentence(error)}", file=sys.__stderr__, flush=True)
+def _say(process: TrainingProcess, error: BaseException) -> None:
+    if process.rank and sys.__stderr__ is not None:
+        print(f"train: {process.name}: {sentence(error)}", file=sys.__stderr__, flush=True)
 
 
 @contextmanager
@@ -195,13 +195,13 @@ def failing_at_once(environment: Mapping[str, str]) -> Iterator[None]:
         raise
 
 
-def refuse_grid(place: Place, words: list[str]) -> None:
+def refuse_grid(process: TrainingProcess, words: list[str]) -> None:
     """A grid under ``torchrun`` is refused: its jobs are trainings of one process each.
 
     Raises:
         ConfigurationError: when ``words`` ask for one.
     """
-    if place.processes > 1 and {"-m", "--multirun"} & set(words):
+    if process.processes > 1 and {"-m", "--multirun"} & set(words):
         raise ConfigurationError(
-            f"a grid (-m) must be run by one process, got {place.processes}: start one torchrun for each training"
+            f"a grid (-m) must be run by one process, got {process.processes}: start one torchrun for each training"
         )

@@ -26,7 +26,7 @@ log = logging.getLogger("attentionvote.train")
 _LEAST_HISTORY = 10  # logged steps from which on it can be said whether a loss fell
 
 
-class Found(NamedTuple):
+class SplitDetections(NamedTuple):
     """What was found in the scenes of a split, and how the proposals cover them; scene by scene."""
 
     results: list[SceneResult]
@@ -35,24 +35,24 @@ class Found(NamedTuple):
 
 def detect_everything(
     module: PoseTraining, data: PartDataModule, weights: Path, device: torch.device
-) -> dict[str, Found]:
+) -> dict[str, SplitDetections]:
     """What the weights of a checkpoint find in all validation and test scenes, by split.
 
     Every process looks at its share; the first one gets all, in the order of the scenes, the others get empty lists.
     """
     load_weights(module, weights)
     module.eval().to(device)
-    found = {}
+    detections = {}
     for name in ("val", "test"):
         pairs = in_order(_detect(module, data, name, device))
-        found[name] = Found([result for result, _ in pairs], [counts for _, counts in pairs])
-    return found
+        detections[name] = SplitDetections([result for result, _ in pairs], [counts for _, counts in pairs])
+    return detections
 
 
 def assess(
     module: PoseTraining,
     data: PartDataModule,
-    found: dict[str, Found],
+    detections: dict[str, SplitDetections],
     model_file: Path,
     tracked: Any,
     step: int,
@@ -65,9 +65,9 @@ def assess(
         ``metrics`` (see ``attentionvote.evaluation.evaluate_at``; precision and recall at the threshold; and
         ``training.proposal_counts.proposal_figures``), ``confidence_threshold`` and ``test_scenes``.
     """
-    results = found["test"].results
-    threshold = best_threshold(found["val"].results, module.part)
-    metrics = evaluate_at(results, module.part, threshold) | proposal_figures(found["test"].proposals)
+    results = detections["test"].results
+    threshold = best_threshold(detections["val"].results, module.part)
+    metrics = evaluate_at(results, module.part, threshold) | proposal_figures(detections["test"].proposals)
     tracked.log_metrics({f"test/{k}": v for k, v in metrics.items()} | {"test/confidence_threshold": threshold}, step)
     metadata = module.metadata | {"confidence_threshold": threshold, "test": metrics}
     save_trained(module.model, metadata, model_file)
@@ -101,13 +101,13 @@ def _draw(
     parts = module.part.parts
     by_threshold = {}
     for k, part in enumerate(parts):
-        own, metric = [scene.of_part(k) for scene in results], PoseMetric.of(part)
-        scores = {f"{100 * t:g} % D": average_precision(own, metric, t * part.diameter) for t in THRESHOLDS}
+        part_results, metric = [scene.of_part(k) for scene in results], PoseMetric.of(part)
+        scores = {f"{100 * t:g} % D": average_precision(part_results, metric, t * part.diameter) for t in THRESHOLDS}
         lines = {label: (s.curve_recall, s.curve_precision) for label, s in scores.items()}
         areas = {label: s.ap for label, s in scores.items()}
         which = f"_{part.name}" if len(parts) > 1 else ""
         tracked.log_figure(f"test/precision_recall{which}.png", precision_recall_figure(lines, areas))
-        against = curves(own, part)
+        against = curves(part_results, part)
         by_threshold[part.name if which else "test"] = against.ap
     tracked.log_figure("test/ap_threshold.png", ap_threshold_figure(against.thresholds, by_threshold))
     batch = next(iter(data.test_dataloader())).first(2).to(module.device)

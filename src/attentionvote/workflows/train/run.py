@@ -35,8 +35,8 @@ from attentionvote.workflows.sweep.trial_report import trial_callbacks
 from attentionvote.workflows.train.data import prepare_data
 from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
 from attentionvote.workflows.train.network import described, network_arguments
-from attentionvote.workflows.train.processes import FirstDoes, Place
-from attentionvote.workflows.train.results import Found, assess, best_score, detect_everything, log_losses
+from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
+from attentionvote.workflows.train.results import SplitDetections, assess, best_score, detect_everything, log_losses
 from attentionvote.workflows.train.settings import TrainSettings
 from attentionvote.workflows.train.tracking import open_tracking
 
@@ -54,15 +54,15 @@ class TrainingRun:
         ValueError: with one sentence, when a setting of model, loss, data or trainer is impossible.
     """
 
-    def __init__(self, cfg: TrainSettings, job: TrainingJob, place: Place, first_does: FirstDoes) -> None:
+    def __init__(self, cfg: TrainSettings, job: TrainingJob, process: TrainingProcess, first_does: FirstDoes) -> None:
         self.cfg, self.job, self.part = cfg, job, job.part
-        self.place, self.first_does = place, first_does
+        self.process, self.first_does = process, first_does
         part, t = job.part, cfg.trainer
         L.seed_everything(cfg.seed, verbose=False)
-        self.threads = t.threads or place.cores
+        self.threads = t.threads or process.cores
         torch.set_num_threads(self.threads)
         arguments = network_arguments(cfg.model, part)
-        model: AttentionVote = AttentionVote(**arguments)
+        model = AttentionVote.from_arguments(arguments)
         loss = AttentionVoteLoss(part, asdict(cfg.loss.weights), cfg.loss.settings)
         self.clouds = CloudSettings(cfg.data.sensor, cfg.data.density, cfg.data.pool, cfg.data.normal_neighbors)
         metadata = {
@@ -100,9 +100,9 @@ class TrainingRun:
         """Everything; the dictionary of the JSON line, None where the first process prints it."""
         start = time.monotonic()
         self._introduce()
-        if not self.place.rank:
+        if not self.process.rank:
             connect(resolve_store(self.cfg.tracking.store))  # said before the scenes are made, not after
-        clouds, digests = prepare_data(self.cfg, self.job, self.clouds, self.workers, self.place, self.first_does)
+        clouds, digests = prepare_data(self.cfg, self.job, self.clouds, self.workers, self.process, self.first_does)
         self.module.metadata["data"] |= digests
         if self.job.dataset is not None:
             self.module.metadata["data"] |= self.job.dataset.evidence
@@ -110,16 +110,16 @@ class TrainingRun:
         data_seconds = time.monotonic() - start
         with plain_loader_errors(), quiet_lightning():
             data = self._data_module(clouds)
-            if self.place.rank:
+            if self.process.rank:
                 self._fit(data, None)
                 self._detect(data)
                 return None
-            with open_tracking(self.cfg, self.job, self.module, self.place.processes) as tracked:
+            with open_tracking(self.cfg, self.job, self.module, self.process.processes) as tracked:
                 progress = self._fit(data, tracked)
                 losses = log_losses(tracked)
-                weights, found = self._detect(data)
+                weights, detections = self._detect(data)
                 model_file, step = self.job.directory / MODEL, self.trainer.global_step
-                assessed = assess(self.module, data, found, model_file, tracked, step)
+                assessed = assess(self.module, data, detections, model_file, tracked, step)
                 result = {
                     "stage": "train",
                     "object": self.part.name,
@@ -159,7 +159,7 @@ class TrainingRun:
             f"{sum(p.numel() for p in self.module.parameters()):,}", self.cfg.trainer.max_epochs,
             self.cfg.trainer.batch_size, self.trainer.strategy.root_device, self.trainer.precision, self.threads,
             "s" * (self.threads > 1),
-            f" in each of {self.place.processes} processes" if self.place.processes > 1 else "",
+            f" in each of {self.process.processes} processes" if self.process.processes > 1 else "",
             ", going on after an interruption" if self.job.run_id else "",
         )  # fmt: skip
 
@@ -175,8 +175,8 @@ class TrainingRun:
             cfg.data.workers,
             self.augmentation,
             cfg.seed,
-            self.place.rank,
-            self.place.processes,
+            self.process.rank,
+            self.process.processes,
         )
 
     def _trainer(self) -> L.Trainer:
@@ -190,7 +190,7 @@ class TrainingRun:
         callbacks += trial_callbacks()
         if t.average_decay:
             callbacks.append(EMAWeightAveraging(decay=t.average_decay, use_buffers=True))
-        if self.place.processes > 1:
+        if self.process.processes > 1:
             callbacks.append(PlainTermination())
         try:
             return self._lightning_trainer(callbacks)
@@ -201,7 +201,7 @@ class TrainingRun:
         t = self.cfg.trainer
         return L.Trainer(
             accelerator=t.accelerator,
-            **self.place.trainer_arguments(),
+            **self.process.trainer_arguments(),
             precision=self._precision(),
             max_epochs=t.max_epochs,
             gradient_clip_val=t.gradient_clip,
@@ -210,7 +210,7 @@ class TrainingRun:
             num_sanity_val_steps=0,
             logger=False,
             callbacks=callbacks,
-            plugins=[self.checkpoint_files, *([RowNormSync()] if self.place.processes > 1 else [])],
+            plugins=[self.checkpoint_files, *([RowNormSync()] if self.process.processes > 1 else [])],
             enable_progress_bar=False,
             enable_model_summary=False,
             default_root_dir=self.job.directory,
@@ -242,7 +242,7 @@ class TrainingRun:
         self.checkpoint_files.before_save = tracked.flush_metrics
         self.trainer.loggers = [RunLogger(tracked)]
 
-    def _detect(self, data: PartDataModule) -> tuple[Path, dict[str, Found]]:
+    def _detect(self, data: PartDataModule) -> tuple[Path, dict[str, SplitDetections]]:
         """The checkpoint that the training ends with, and what it finds (in the first process, of all)."""
         files = [self._checkpoints / "best.ckpt", self._checkpoints / "last.ckpt"]
         weights = Path(self.first_does("weights", lambda: str(next(path for path in files if path.is_file()))))
