@@ -72,11 +72,11 @@ def test_neighbours_that_are_given_are_those_that_are_found(
     points, normals = (a[None] for a in make_cloud(1))
     given = find_neighbors(points, session.layout)
     assert len(given) == 5
-    inside, outside = session.run(points, normals), session.run(points, normals, found=given)
+    inside, outside = session.run(points, normals), session.run(points, normals, neighbors=given)
     for name, value in inside.items():
         np.testing.assert_array_equal(outside[name], value)
     given[1] = given[1][::-1]
-    assert not np.array_equal(session.run(points, normals, found=given)["vote_xyz"], inside["vote_xyz"])
+    assert not np.array_equal(session.run(points, normals, neighbors=given)["vote_xyz"], inside["vote_xyz"])
 
 
 @pytest.mark.slow

@@ -44,13 +44,13 @@ def test_missing_measurements_are_counted_and_left_out(make_card: MakeCard) -> N
     for cloud in (image, image.reshape(-1, 3), np.where(np.isnan(image), np.inf, image)):
         scan = measured_points(cloud, make_card())
         np.testing.assert_array_equal(scan.points, np.float32([[0.1, 0.2, 0.8], [0.3, 0.4, 0.9]]))
-        assert (scan.given, scan.measured, scan.warnings) == (20, 2, ())
+        assert (scan.total, scan.measured, scan.warnings) == (20, 2, ())
 
 
 def test_the_origin_is_how_some_sensors_write_missing(make_card: MakeCard) -> None:
     scan = measured_points(np.float32([[0, 0, 0], [0, 0, 0.8], [-0.0, 0, 0]]), make_card())
     np.testing.assert_array_equal(scan.points, np.float32([[0, 0, 0.8]]))
-    assert (scan.given, scan.measured) == (3, 1)
+    assert (scan.total, scan.measured) == (3, 1)
 
 
 def test_the_limit_counts_measured_points(make_card: MakeCard, make_cloud: MakeCloud) -> None:

@@ -178,6 +178,7 @@ def test_a_study_that_has_its_total_is_reported_without_a_worker(words: list[str
         ("executor=rya", "executor must be one of local, ray, slurm; got 'rya', did you mean 'ray'?"),
         ("save_as=a/b", "save_as must be a name of letters, digits, - and _, got 'a/b'"),
         ("storage=nonsense", "storage must be the SQLAlchemy URI of a database that answers.*got nonsense"),
+        ("~model.merge_fraction", "takes no word that deletes a setting"),
         ("~trainer.log_every_steps", "trainer.log_every_steps must be given"),
     ],
 )
@@ -213,9 +214,7 @@ def test_trials_of_one_machine_share_its_gpus(words: list[str], monkeypatch: pyt
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
 
     def gpu(slot: int, *more: str) -> str | None:
-        said = [*words, *more]
-        job = SweepJob(compose(SweepSettings, said), sweep.training_words(said), "smoke")
-        return job._environment(9, slot).get("CUDA_VISIBLE_DEVICES")
+        return sweep_of([*words, *more])._environment(9, slot).get("CUDA_VISIBLE_DEVICES")
 
     assert [gpu(slot, "workers=3") for slot in range(3)] == ["4", "6", "4"]
     assert gpu(0, "workers=1") is None

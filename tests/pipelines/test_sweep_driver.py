@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from typing import Any
 import pytest
 from optuna.trial import TrialState
 
+from attentionvote.execution.job_executors import LocalJobs
 from attentionvote.workflows.sweep.driver import SweepDriver
 from attentionvote.workflows.sweep.space import Setting
 from attentionvote.workflows.sweep.study import Ledger, open_study
@@ -50,27 +53,26 @@ import sys
 sys.path[:0] = [{str(Path(__file__).parent)!r}]
 from test_sweep_driver import driver
 from pathlib import Path
-try: driver(Path(sys.argv[1]), int(sys.argv[3]))[1].run(int(sys.argv[2]), lambda: None)
+try: driver(Path(sys.argv[1]), int(sys.argv[3]), heartbeat_s=1)[1].run(int(sys.argv[2]), lambda: None)
 except KeyboardInterrupt: sys.exit(130)
 """
 
 
-def driver(folder: Path, workers: int = 1) -> tuple[Ledger, SweepDriver]:
-    """A study in a folder and what drives it."""
-    study = open_study(f"sqlite:///{folder}/study.db", "s", 60)
-    ledger = Ledger(study, SPACE, seed=0, random_trials=2, folder=folder)
+def driver(folder: Path, workers: int = 1, place: str = "", heartbeat_s: int = 60) -> tuple[Ledger, SweepDriver]:
+    """A study in a folder and what drives it, from this place."""
+    stored = open_study(f"sqlite:///{folder}/study.db", "s")
+    ledger = Ledger(stored, SPACE, seed=0, random_trials=2, folder=folder / place, heartbeat_s=heartbeat_s)
     (folder / "job.py").write_text(JOB, encoding="utf-8")
     return ledger, SweepDriver(
         ledger,
+        LocalJobs(folder / "job.py"),
         words=lambda values: [str(folder), str(values["x"])],
         directory=lambda values: folder / f"training-{values['x']:.6f}",
         environment=lambda number, _: {"ATTENTIONVOTE_TRIAL": json.dumps({"number": number})},
         workers=workers,
         retries=1,
-        heartbeat_s=0.2,
         logs=folder / "logs",
         ended=lambda trial: (folder / f"ended-{trial.number}").touch(exist_ok=False),
-        script=folder / "job.py",
     )
 
 
@@ -103,6 +105,15 @@ def command_line_of(pid: str) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return ""
+
+
+def may_run(ledger: Ledger) -> bool:
+    """Whether no other sweep is at the study any more."""
+    try:
+        ledger.check()
+    except ValueError:
+        return False
+    return True
 
 
 def until(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
@@ -147,7 +158,7 @@ def test_two_at_a_time_and_never_two_at_one_training(tmp_path: Path, does: Does)
     assert max(together) == 2
     assert states(ledger) == ["COMPLETE"] * 4
     # Somebody is at the training of the next trial: it waits.
-    trial, values = Ledger(ledger.study, SPACE, 0, 2, tmp_path).begin()
+    trial, values = Ledger(ledger.stored, SPACE, 0, 2, tmp_path, 60).begin()
     place = tmp_path / f"training-{values['x']:.6f}"
     place.mkdir(exist_ok=True)
     with (place / ".lock").open("w") as lock:
@@ -205,6 +216,53 @@ def test_ctrl_c_ends_the_trials_orderly_and_they_go_on(tmp_path: Path, does: Doe
     assert states(ledger) == ["COMPLETE"] * 3
     assert ledger.count(TrialState.COMPLETE) == 3
     assert len(list((tmp_path / "logs").iterdir())) == 3
+
+
+def test_paused_for_too_long_it_leaves_its_trials_to_the_sweep_that_took_them_over(tmp_path: Path, does: Does) -> None:
+    does({0: "wait", 1: "wait"})
+    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "2", "2"], text=True, stderr=-1)
+    until(lambda: len(notes(tmp_path)) == 2, process)
+    process.send_signal(signal.SIGSTOP)
+    # Awake again, it would find this trial crashed and take it up.
+    os.kill(int(next(note[2] for note in notes(tmp_path) if note[1] == "1")), signal.SIGKILL)
+    does({})
+    ledger, sweep = driver(tmp_path, workers=2, place="elsewhere", heartbeat_s=1)
+    until(lambda: may_run(ledger), process)
+    errors = []
+
+    def awake() -> None:  # while the other's trials run
+        if not errors:
+            process.send_signal(signal.SIGCONT)
+            errors.append(process.communicate(timeout=60)[1])
+
+    sweep.run(2, awake)
+    sentence = (
+        "ValueError: the sweep stops, because it gave no sign of life for 3 s and the one at [^ ]+/elsewhere took the "
+        "study s over: leave it to that one, or end that one and start the same command here again"
+    )
+    assert re.fullmatch(sentence, errors[0].splitlines()[-1])
+    assert process.returncode == 1
+    assert states(ledger) == ["COMPLETE"] * 2
+    assert all("crashes" not in trial.user_attrs for trial in ledger.trials)
+    assert sorted(note[0] for note in notes(tmp_path)) == ["end", "end", "interrupted", *["start"] * 4]
+    assert len({note[3] for note in notes(tmp_path)}) == 2  # taken over with their own parameters
+    # The study is the other's as long as that one works at it; afterwards it may go on here.
+    driver(tmp_path)[1].run(3, lambda: None)
+    assert states(ledger) == ["COMPLETE"] * 3
+
+
+def test_a_short_pause_changes_nothing(tmp_path: Path, does: Does) -> None:
+    does({})
+    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "2", "2"], text=True, stderr=-1)
+    until(lambda: len(notes(tmp_path)) > 1, process)
+    process.send_signal(signal.SIGSTOP)
+    ledger = driver(tmp_path, place="elsewhere", heartbeat_s=1)[0]
+    with pytest.raises(ValueError, match="must have one sweep at a time"):
+        ledger.lost()
+    process.send_signal(signal.SIGCONT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert states(ledger) == ["COMPLETE"] * 2
 
 
 @pytest.mark.usefixtures("does")

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import optuna
 import pytest
-from optuna.trial import Trial, TrialState
+from optuna.storages import RDBStorage
+from optuna.trial import TrialState
 
 from attentionvote.workflows.sweep.space import Setting
 from attentionvote.workflows.sweep.study import Ledger, make_pruner, open_study, study_name
+from attentionvote.workflows.sweep.trial_report import TrialReport
 
 SPACE = [
     Setting("x", "float", 0.0, 1.0),
@@ -21,8 +25,8 @@ SPACE = [
 
 
 def ledger(folder: Path, name: str = "s", place: str = "here", heartbeat_s: int = 60) -> Ledger:
-    study = open_study(f"sqlite:///{folder / 'study.db'}", name, heartbeat_s)
-    return Ledger(study, SPACE, seed=1, random_trials=2, folder=folder / place)
+    stored = open_study(f"sqlite:///{folder / 'study.db'}", name)
+    return Ledger(stored, SPACE, seed=1, random_trials=2, folder=folder / place, heartbeat_s=heartbeat_s)
 
 
 def score(values: dict) -> float:
@@ -64,6 +68,27 @@ def test_a_lost_trial_keeps_its_number_parameters_and_reports(tmp_path: Path) ->
     assert (again.best, again.lost(), len(again.trials)) == (None, [], 1)
 
 
+@pytest.mark.filterwarnings("ignore")  # heartbeats of Optuna's are experimental
+def test_a_study_without_a_lease_goes_on(tmp_path: Path) -> None:
+    # As sweeps wrote them before: whose a trial is was an attribute of it, its signs of life were Optuna's.
+    url = f"sqlite:///{tmp_path / 'study.db'}"
+    storage = RDBStorage(url, heartbeat_interval=60, grace_period=180)
+    study = optuna.create_study(storage=storage, study_name="s", direction="maximize")
+    for _ in range(2):
+        begun = study.ask()
+        for setting in SPACE:
+            setting.suggest(begun)
+        begun.set_user_attr("owner", "elsewhere:/sweeps/s")
+    study.tell(0, 0.5)
+    again = ledger(tmp_path)
+    (lost,) = again.lost()
+    trial, values = again.begin(lost)
+    again.end(trial, TrialState.COMPLETE, score(values))
+    assert [t.params for t in again.trials] == [t.params for t in study.trials]
+    assert again.count(TrialState.COMPLETE) == 2
+    storage.engine.dispose()
+
+
 def test_one_sweep_at_a_time_from_several_places(tmp_path: Path) -> None:
     first = ledger(tmp_path, heartbeat_s=1)
     trial, values = first.begin()
@@ -80,8 +105,25 @@ def test_one_sweep_at_a_time_from_several_places(tmp_path: Path) -> None:
             time.sleep(0.2)
     assert second.begin(lost)[1] == values
     with pytest.raises(ValueError, match=r"/elsewhere gave a sign of life"):
-        first.lost()
-    second.beat([trial])
+        ledger(tmp_path, heartbeat_s=1).lost()
+    with pytest.raises(ValueError, match=r"gave no sign of life for 3 s and the one at .*/elsewhere took the study s"):
+        first.end(trial, TrialState.FAIL)
+    assert [t.state for t in second.trials] == [TrialState.RUNNING]
+
+
+def test_a_training_whose_trial_was_taken_over_reports_nothing_and_ends(tmp_path: Path) -> None:
+    here = ledger(tmp_path)
+    here.begin()
+    report = TrialReport(here.stored, 0, here.owner)
+    validated: Any = SimpleNamespace(
+        sanity_checking=False, callback_metrics={"val/ap": 0.5}, current_epoch=0, max_epochs=4
+    )
+    report.on_validation_end(validated, validated)
+    here.stored.lease("elsewhere:/sweeps/s")
+    validated.current_epoch = 1
+    with pytest.raises(ValueError, match="because the sweep at elsewhere:/sweeps/s took its trial 0 over"):
+        report.on_validation_end(validated, validated)
+    assert here.trials[0].intermediate_values == {1: 0.5}
 
 
 @pytest.mark.parametrize(
@@ -96,7 +138,7 @@ def test_a_database_that_does_not_answer_is_one_sentence_without_the_password(ur
     with pytest.raises(
         ValueError, match=f"storage must be the SQLAlchemy URI of a database that answers.*{shown}"
     ) as error:
-        open_study(url, "s", 60)
+        open_study(url, "s")
     assert "\n" not in str(error.value)
     assert "secret" not in str(error.value)
 
@@ -104,11 +146,11 @@ def test_a_database_that_does_not_answer_is_one_sentence_without_the_password(ur
 @pytest.mark.parametrize("kind", ["median", "hyperband", "none"])
 def test_the_pruner_ends_a_bad_trial_after_its_least_epochs(kind: str, tmp_path: Path) -> None:
     pruner = make_pruner(kind, least_trials=2, least_epochs=4, reduction=3, validate_every=2, max_epochs=12)
-    study = open_study(f"sqlite:///{tmp_path}/study.db", kind, 60, pruner)
+    study = open_study(f"sqlite:///{tmp_path}/study.db", kind, pruner).study
 
     def train(value: float) -> int:
         """The epoch that a trial of this score ends at."""
-        trial = Trial(study, study._storage.create_new_trial(study._study_id))
+        trial = study.ask()
         for epoch in range(2, 13, 2):
             trial.report(value, epoch)
             if epoch < 12 and trial.should_prune():
@@ -134,8 +176,8 @@ def test_a_study_in_postgresql_stands_a_lost_trial_and_two_places(postgresql: An
     name = postgresql.create()
 
     def opened(place: str) -> Ledger:
-        study = open_study(postgresql.uri(name), "s", 60, make_pruner("median", 1, 1, 3, 1, 9))
-        return Ledger(study, SPACE, seed=1, random_trials=2, folder=tmp_path / place)
+        stored = open_study(postgresql.uri(name), "s", make_pruner("median", 1, 1, 3, 1, 9))
+        return Ledger(stored, SPACE, seed=1, random_trials=2, folder=tmp_path / place, heartbeat_s=60)
 
     first = opened("here")
     trial, values = first.begin()
@@ -148,5 +190,6 @@ def test_a_study_in_postgresql_stands_a_lost_trial_and_two_places(postgresql: An
     assert (same, again.trials[0].intermediate_values) == (values, {4: 0.25})
     assert again.best is not None
     for used in (first, again):
-        used.study._storage.remove_session()
+        used.stored.storage.remove_session()
+        used.stored.storage.engine.dispose()
     postgresql.drop(name)

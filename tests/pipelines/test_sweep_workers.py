@@ -16,11 +16,10 @@ from typing import Any
 import pytest
 
 from attentionvote.execution import RayCluster
+from attentionvote.execution.job_executors import WorkerJobs
 from attentionvote.workflows.sweep.driver import SweepDriver
-from attentionvote.workflows.sweep.job import TRIAL_JOB
 from attentionvote.workflows.sweep.space import Setting
 from attentionvote.workflows.sweep.study import Ledger, open_study
-from attentionvote.workflows.sweep.trial_place import log_of, on_worker
 
 # Stands for a training: notes its start with its process, its parent and a variable; does what the test says of it.
 JOB = """
@@ -56,29 +55,23 @@ except KeyboardInterrupt: sys.exit(130)
 
 def sweep(folder: Path, executor: str, total: int) -> Ledger:
     """Bring the study in the folder to its total, two trials at a time."""
-    study = open_study(f"sqlite:///{folder}/study.db", "s", 60)
-    ledger = Ledger(study, [Setting("x", "float", 0.0, 1.0)], seed=0, random_trials=2, folder=folder)
+    stored = open_study(f"sqlite:///{folder}/study.db", "s")
+    ledger = Ledger(stored, [Setting("x", "float", 0.0, 1.0)], seed=0, random_trials=2, folder=folder, heartbeat_s=1)
     (folder / "job.py").write_text(JOB, encoding="utf-8")
-
-    def environment(number: int, _: int) -> dict[str, str]:
-        trial = {"ATTENTIONVOTE_TRIAL": json.dumps({"number": number})}
-        return trial | on_worker(executor, cluster, 1, log_of(folder / "logs", number), folder / "job.py")
-
     cluster: dict[str, Any] = {"gpus": 0, "slurm": {"folder": str(folder / "slurm"), "system": "local", "poll_s": 0.1}}
     with ExitStack() as stack:
         if executor == "ray":
-            cluster["address"] = stack.enter_context(RayCluster().kept(2)).address
+            cluster["address"] = stack.enter_context(RayCluster().shared(2)).address
         SweepDriver(
             ledger,
+            WorkerJobs(folder / "job.py", executor, cluster, threads=1),
             words=lambda values: [str(folder), str(values["x"])],
             directory=lambda values: folder / f"training-{values['x']:.6f}",
-            environment=environment,
+            environment=lambda number, _: {"ATTENTIONVOTE_TRIAL": json.dumps({"number": number})},
             workers=2,
             retries=1,
-            heartbeat_s=1,
             logs=folder / "logs",
             ended=str,
-            script=TRIAL_JOB,
         ).run(total, lambda: None)
     return ledger
 
@@ -141,8 +134,7 @@ Start = Callable[[str, int], subprocess.Popen[str]]
 
 def states_of(folder: Path) -> list[str]:
     """The states of the trials as another process sees them."""
-    study = open_study(f"sqlite:///{folder}/study.db", "s", 60)
-    return [trial.state.name for trial in study.trials]
+    return [trial.state.name for trial in open_study(f"sqlite:///{folder}/study.db", "s").study.trials]
 
 
 @pytest.mark.slow
@@ -159,7 +151,7 @@ def test_on_ray_every_end_comes_back_and_a_killed_sweep_goes_on(tmp_path: Path, 
     process = start("ray", 5)
     _, err = process.communicate(timeout=240)
     assert process.returncode == 0, err
-    ledger = Ledger(open_study(f"sqlite:///{tmp_path}/study.db", "s", 60), [], 0, 2, tmp_path)
+    ledger = Ledger(open_study(f"sqlite:///{tmp_path}/study.db", "s"), [], 0, 2, tmp_path, 1)
     assert [trial.state.name for trial in ledger.trials] == ["PRUNED", "COMPLETE", "COMPLETE", "COMPLETE", "FAIL"]
     assert ledger.trials[4].user_attrs["reason"] == "the cloud must be finite, got 3 NaN"
     assert [trial.user_attrs.get("crashes", 0) for trial in ledger.trials] == [0, 1, 0, 1, 0]
@@ -167,7 +159,7 @@ def test_on_ray_every_end_comes_back_and_a_killed_sweep_goes_on(tmp_path: Path, 
     assert numbers == ["0", "1", "1", "2", "2", "3", "3", "4"]
     assert len({(note[0], note[3]) for note in notes(tmp_path)}) == 5  # a number has one set of parameters
     assert {note[4] for note in notes(tmp_path)} == {"secret"}
-    assert all("epoch 1" in log_of(tmp_path / "logs", n).read_text() for n in range(5))
+    assert all("epoch 1" in (tmp_path / "logs" / f"trial_{n:03d}.log").read_text() for n in range(5))
 
 
 @pytest.mark.slow

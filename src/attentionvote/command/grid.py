@@ -80,7 +80,7 @@ def run_grid(
 
 def _run_job(job: Sequence[str], parent: Any) -> Outcome:
     below = [] if parent is None else [f"tracking.parent={parent.id}"]
-    outcome = JobProcess(sys.argv[0], [*job, *below]).wait()
+    outcome = JobProcess(sys.argv[0], [*job, *below]).result()
     if outcome.code != INTERRUPTED:
         answer = outcome.result if outcome.result is not None else {"failed": outcome.sentence}
         print(json.dumps({"overrides": list(job), **answer}), flush=True)

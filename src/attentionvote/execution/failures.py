@@ -1,4 +1,4 @@
-"""What can go wrong with many jobs, counted: a worker that died is another matter than a task that raised."""
+"""Failures among many jobs, counted: a worker that died is another matter than a task that raised."""
 
 from __future__ import annotations
 

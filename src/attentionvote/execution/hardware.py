@@ -1,4 +1,4 @@
-"""What this process may use of the machine."""
+"""The cores and GPUs that this process may use."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def cores() -> int:
 
 def visible_gpus(environment: Mapping[str, str], present: Path = _GPUS) -> list[str]:
     """The GPUs that a process with this environment may use, as CUDA_VISIBLE_DEVICES names them; told without torch."""
-    said = environment.get("CUDA_VISIBLE_DEVICES")
-    if said is None:
+    devices = environment.get("CUDA_VISIBLE_DEVICES")
+    if devices is None:
         return [str(index) for index in range(len(list(present.iterdir())))] if present.is_dir() else []
-    found: list[str] = []
-    for name in (entry.strip() for entry in said.split(",")):
+    gpus: list[str] = []
+    for name in (entry.strip() for entry in devices.split(",")):
         if name in ("", "-1"):
             break  # CUDA too sees none of what comes after the first that is no device
-        found.append(name)
-    return found
+        gpus.append(name)
+    return gpus
 
 
 def gpu_of_slot(gpus: Sequence[str], slot: int) -> dict[str, str]:

@@ -19,7 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 PARENT, FAILURE = "ATTENTIONVOTE_JOB_PARENT", "ATTENTIONVOTE_JOB_FAILURE"
 INTERRUPTED = 130
@@ -43,8 +43,24 @@ class Outcome:
     sentence: str
 
 
+class JobFuture(Protocol):
+    """A job that was started somewhere, as ``concurrent.futures`` has it; a failure is an outcome, not an exception."""
+
+    def done(self) -> bool:
+        """Whether the job has ended."""
+
+    def result(self) -> Outcome:
+        """How it ended; waits for that."""
+
+    def cancel(self) -> None:
+        """Have it end orderly."""
+
+    def kill(self) -> None:
+        """End it at once."""
+
+
 class JobProcess:
-    """A running job; start it in a thread that lives as long as the job may.
+    """A running job, a future of its outcome; start it in a thread that lives as long as the job may.
 
     Args:
         script: of the verb.
@@ -62,7 +78,7 @@ class JobProcess:
     ) -> None:
         self._outcome: Outcome | None = None
         self._stdout, self._failure = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
-        own = {PARENT: str(os.getpid()), FAILURE: str(self._failure.fileno())}
+        both_ends = {PARENT: str(os.getpid()), FAILURE: str(self._failure.fileno())}
         try:
             # A session of its own: Ctrl-C reaches us alone, and we pass it on, once.
             self._process = subprocess.Popen(
@@ -70,7 +86,7 @@ class JobProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=self._stdout,
                 stderr=stderr,
-                env={**os.environ, **(environment or {}), **own},
+                env={**os.environ, **(environment or {}), **both_ends},
                 pass_fds=[self._failure.fileno()],
                 start_new_session=True,
             )
@@ -78,39 +94,30 @@ class JobProcess:
             self._close()
             raise
 
-    @property
-    def pid(self) -> int:
-        """The process id."""
-        return self._process.pid
+    def done(self) -> bool:
+        """Whether the job has ended."""
+        return self._process.poll() is not None
 
-    def poll(self) -> Outcome | None:
-        """How the job ended, None while it runs."""
-        code = self._process.poll()
-        if code is not None and self._outcome is None:
+    def result(self) -> Outcome:
+        """Wait for the end; KeyboardInterrupt is passed on to the job and raised when it has ended."""
+        if self._outcome is None:
+            try:
+                code = self._process.wait()
+            except BaseException:
+                cancel_all([self])
+                raise
             self._outcome = self._read(code)
             self._close()
         return self._outcome
 
-    def wait(self) -> Outcome:
-        """Wait for the end; KeyboardInterrupt is passed on to the job and raised when it has ended."""
-        try:
-            self._process.wait()
-        except BaseException:
-            interrupt([self])
-            raise
-        outcome = self.poll()
-        assert outcome is not None
-        return outcome
-
-    def signal(self, number: int) -> None:
-        """Send a signal; nothing happens when the job has ended."""
-        self._process.send_signal(number)
+    def cancel(self) -> None:
+        """Ctrl-C: the job may end orderly; nothing happens when it has ended."""
+        self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
         """End the job at once; nothing happens when it has ended."""
         self._process.kill()
-        self._process.wait()
-        self.poll()
+        self.result()
 
     def _close(self) -> None:
         self._stdout.close()
@@ -139,13 +146,13 @@ def _text(file: IO[bytes]) -> str:
     return file.read().decode("utf-8", errors="replace")
 
 
-def interrupt(jobs: Sequence[JobProcess], grace_s: float = _GRACE_S) -> None:
+def cancel_all(jobs: Sequence[JobFuture], grace_s: float = _GRACE_S) -> None:
     """Ctrl-C for jobs: each may end orderly, a second Ctrl-C or the end of the grace period ends them at once."""
     for job in jobs:
-        job.signal(signal.SIGINT)
+        job.cancel()
     deadline = time.monotonic() + grace_s
     try:
-        while any(job.poll() is None for job in jobs) and time.monotonic() < deadline:
+        while not all(job.done() for job in jobs) and time.monotonic() < deadline:
             time.sleep(0.05)
     except KeyboardInterrupt:
         pass

@@ -10,13 +10,14 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from typing import Any
 
 from attentionvote.execution.failures import Attempts
-from attentionvote.execution.outcome import failed, inherited, perform, worker_environment
+from attentionvote.execution.outcome import inherited, perform, worker_environment
 
 _END_S = 5.0  # what a worker gets to end by itself
 
@@ -91,8 +92,8 @@ class _Pool:
                 worker = lines[event] if isinstance(event, Connection) else ends[event]  # type: ignore[index]
                 if worker not in self.workers:
                     continue  # its line and its end came together
-                said = worker.receive()
-                if said is None:
+                message = worker.receive()
+                if message is None:
                     self._bury(worker)
                     continue
                 index = worker.job
@@ -101,7 +102,7 @@ class _Pool:
                     self.attempts.finished += 1
                 self._employ(worker)
                 if index is not None:
-                    yield index, said
+                    yield index, message
 
     def _employ(self, worker: _Worker) -> None:
         """Give the worker the next job, or let it go."""
@@ -144,28 +145,11 @@ def _serve(line: Connection) -> None:
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
         line.send_bytes(b"ready")
-        try:
-            task = pickle.loads(line.recv_bytes())
-        except EOFError:
-            return
-        except Exception as error:
-            line.recv_bytes()
-            line.send_bytes(failed(error))
-            return
+        task = cache(partial(pickle.loads, line.recv_bytes()))
         while True:
-            line.send_bytes(perform(_Unpickled(task), line.recv_bytes()))
+            line.send_bytes(perform(task, line.recv_bytes()))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
-
-
-@dataclass(frozen=True)
-class _Unpickled:
-    """The task of a pickled job: a job that cannot be read fails as one whose task raised."""
-
-    task: Callable[[Any], Any]
-
-    def __call__(self, job: bytes) -> Any:
-        return self.task(pickle.loads(job))
 
 
 def _end_all(workers: list[_Worker], leaving: list[_Worker]) -> None:

@@ -14,14 +14,19 @@ from typing import Any
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def perform(task: Callable[[Any], Any], job: Any) -> bytes:
-    """Do one job; the pickled pair (it succeeded, its result or exception). Never raises."""
+def perform(task: Callable[[], Callable[[Any], Any]], job: bytes) -> bytes:
+    """Do one pickled job in a worker; the pickled pair (it succeeded, its result or exception). Never raises.
+
+    Args:
+        task: gets the task, unpickled once a worker; where that fails, every job does.
+        job: pickled.
+    """
     try:
-        succeeded, value = True, task(job)
+        value = task()(pickle.loads(job))
     except BaseException as error:
         return failed(error)
     try:
-        return pickle.dumps((succeeded, value))
+        return pickle.dumps((True, value))
     except Exception as error:
         return failed(TypeError(f"the result of a job must be picklable, got {type(value).__name__}: {error}"))
 
@@ -54,8 +59,8 @@ def result_of(outcome: bytes) -> Any:
 
 def worker_environment(threads: int) -> dict[str, str]:
     """Variables of a worker's process: its threads, and where this process finds modules."""
-    found = os.pathsep.join(path for path in sys.path if path)
-    return dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"PYTHONPATH": found}
+    search_path = os.pathsep.join(path for path in sys.path if path)
+    return dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"PYTHONPATH": search_path}
 
 
 @contextmanager

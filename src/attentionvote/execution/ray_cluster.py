@@ -10,6 +10,7 @@ import uuid
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ class RayCluster:
             )
 
     @contextmanager
-    def kept(self, cores: int) -> Iterator[RayCluster]:
+    def shared(self, cores: int) -> Iterator[RayCluster]:
         """One cluster for many calls, those of child processes too: itself, or one of this machine for the block.
 
         Args:
@@ -91,10 +92,10 @@ class RayCluster:
                 ray.shutdown()
 
     def _join(self, ray: Any, cores: int) -> None:
-        own = {} if self.address else {"num_cpus": cores, "include_dashboard": False}
-        own |= {} if self.address else {"object_store_memory": _OBJECT_STORE}
+        started = {} if self.address else {"num_cpus": cores, "include_dashboard": False}
+        started |= {} if self.address else {"object_store_memory": _OBJECT_STORE}
         try:
-            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **own)
+            ray.init(address=self.address or "local", log_to_driver=False, logging_level="error", **started)
         except Exception as error:  # Ray's own too, of a node that takes too long to start
             first = str(error).strip().partition("\n")[0]
             raise ConnectionError(
@@ -153,27 +154,20 @@ class RayCluster:
 
 def _perform(token: str, stored: list[Any], folder: str, job: bytes) -> bytes:
     """One job in a worker of the cluster, in the driver's working directory."""
-    return perform(_Call(token, stored, folder), job)
+    return perform(partial(_task, token, stored, folder), job)
 
 
-@dataclass(frozen=True)
-class _Call:
-    """Fetches the task once a worker process."""
+def _task(token: str, stored: list[Any], folder: str) -> Callable[[Any], Any]:
+    """The task of a call, fetched once a worker process."""
+    global _held
+    if _held is None or _held[0] != token:
+        import ray
 
-    token: str
-    stored: list[Any]
-    folder: str
-
-    def __call__(self, job: bytes) -> Any:
-        global _held
-        if _held is None or _held[0] != self.token:
-            import ray
-
-            if not Path(self.folder).is_dir():
-                raise FileNotFoundError(
-                    f"the Ray worker on {socket.gethostname()} has no folder {self.folder}: the machines of a cluster "
-                    "must share the file system under the same path (docs/scaling.md)"
-                )
-            os.chdir(self.folder)
-            _held = self.token, pickle.loads(ray.get(self.stored[0]))
-        return _held[1](pickle.loads(job))
+        if not Path(folder).is_dir():
+            raise FileNotFoundError(
+                f"the Ray worker on {socket.gethostname()} has no folder {folder}: the machines of a cluster "
+                "must share the file system under the same path (docs/scaling.md)"
+            )
+        os.chdir(folder)
+        _held = token, pickle.loads(ray.get(stored[0]))
+    return _held[1]

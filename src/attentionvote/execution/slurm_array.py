@@ -16,6 +16,7 @@ import time
 import uuid
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -188,21 +189,9 @@ class _Element:
     share: list[tuple[int, bytes]]
 
     def __call__(self) -> None:
-        task = _Pickled((self.call / "task.pkl").read_bytes())
+        task = cache(partial(pickle.loads, (self.call / "task.pkl").read_bytes()))
         for index, job in self.share:
             outcome = perform(task, job)
             temporary = self.call / "outcomes" / f".{index}.{os.getpid()}"
             temporary.write_bytes(outcome)
             temporary.replace(self.call / "outcomes" / str(index))
-
-
-class _Pickled:
-    """The pickled task, unpickled by its first job."""
-
-    def __init__(self, task: bytes) -> None:
-        self.pickled, self.task = task, None
-
-    def __call__(self, job: bytes) -> Any:
-        if self.task is None:
-            self.task = pickle.loads(self.pickled)
-        return self.task(pickle.loads(job))  # type: ignore[misc]

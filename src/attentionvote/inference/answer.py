@@ -1,4 +1,4 @@
-"""What an estimator answers: poses, or an abstention with its reason."""
+"""An estimator's answer: poses, or an abstention with its reason."""
 
 from __future__ import annotations
 
@@ -134,16 +134,16 @@ def detections_from(outputs: Mapping[str, NDArray[np.float32]], card: ModelCard)
     """
     heat, confidence = outputs["peak_heat"][0], outputs["confidence"][0]
     center, quaternion = outputs["center"][0].astype(np.float64), outputs["quaternion"][0].astype(np.float64)
-    kept = is_detection(heat, confidence, card.peak_threshold, card.confidence_threshold)
+    confident = is_detection(heat, confidence, card.peak_threshold, card.confidence_threshold)
     length = np.linalg.norm(quaternion, axis=1)
     sound = np.isfinite(center).all(axis=1) & np.isfinite(length) & (length > 1e-6)
     sound &= np.isfinite(heat) & np.isfinite(confidence)
-    index = np.flatnonzero(kept & sound)
+    index = np.flatnonzero(confident & sound)
     index = index[np.argsort(-confidence[index], kind="stable")]
     poses = transform(matrix_from_quaternion(quaternion[index]), center[index])
     names = outputs["class_logits"][0][index].argmax(axis=1)
-    found = tuple(
+    detections = tuple(
         Detection(pose, float(confidence[i]), card.classes[name], float(heat[i]))
         for pose, i, name in zip(poses, index, names, strict=True)
     )
-    return found, int((kept & ~sound).sum())
+    return detections, int((confident & ~sound).sum())

@@ -1,4 +1,4 @@
-"""Whether a sensor sees the bin at all: a blind one must not be taken for an empty bin."""
+"""The test for a sensor that does not see the bin: a blind one must not be taken for an empty bin."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _looks_at_bin(
     origin = bin_from_camera[:3, 3]
     direction = apply(bin_from_camera, rays) - origin
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = (low - origin) / direction, (high - origin) / direction
-    enters = np.nanmax(np.minimum(one, other), axis=1, initial=0.0)
-    leaves = np.nanmin(np.maximum(one, other), axis=1, initial=np.inf)
+        to_low, to_high = (low - origin) / direction, (high - origin) / direction
+    enters = np.nanmax(np.minimum(to_low, to_high), axis=1, initial=0.0)
+    leaves = np.nanmin(np.maximum(to_low, to_high), axis=1, initial=np.inf)
     return enters <= leaves

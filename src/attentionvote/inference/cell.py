@@ -149,13 +149,15 @@ def _whole_number(digits: str) -> float:
     return int(digits) if len(digits) < 20 else float(digits)
 
 
-def _check_keys(what: str, value: Any, known: Collection[str], needed: Collection[str]) -> None:
+def _check_keys(what: str, value: Any, possible: Collection[str], needed: Collection[str]) -> None:
     if not isinstance(value, dict):
-        raise InputError(f"{what} must be a JSON object with {', '.join(known)}, got {type(value).__name__}")
+        raise InputError(f"{what} must be a JSON object with {', '.join(possible)}, got {type(value).__name__}")
     for key in value:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
-            raise InputError(f"{what} must have the keys {', '.join(known)}; got {key[:60]!r}, did you mean {near!r}?")
+        if key not in possible:
+            near = difflib.get_close_matches(key, possible, n=1, cutoff=0.0)[0]
+            raise InputError(
+                f"{what} must have the keys {', '.join(possible)}; got {key[:60]!r}, did you mean {near!r}?"
+            )
     for key in needed:
         if key not in value:
             raise InputError(f"{what} must have {key}, but it is missing")

@@ -190,13 +190,13 @@ def _estimate(options: argparse.Namespace) -> int:
     if content.startswith(PNG_MAGIC):
         if cell.camera is None:
             raise InputError(f"{name} is a depth image and needs its camera: describe it in a cell file, --cell FILE")
-        given: dict[str, Any] = {"depth": read_depth(content, name), "camera": cell.camera}
+        scan: dict[str, Any] = {"depth": read_depth(content, name), "camera": cell.camera}
     else:
-        given = {"points": cell.cloud.metres(read_cloud(content, name, budget=Budget(most_seconds=_MOST_READING_S)))}
+        scan = {"points": cell.cloud.metres(read_cloud(content, name, budget=Budget(most_seconds=_MOST_READING_S)))}
     with PoseEstimator(
         options.bundle, threads=options.threads, crop=cell.crop, camera=cell.camera, trusted=_trusted(options)
     ) as estimator:
-        answer = estimator.estimate(**given, deadline_s=deadline_s)
+        answer = estimator.estimate(**scan, deadline_s=deadline_s)
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
     else:
@@ -218,15 +218,15 @@ def table(answer: Estimate | Abstention) -> str:
     if isinstance(answer, Abstention):
         return f"{answer.part}: no pose, {answer.reason}: {answer.message}\n{facts}"
     rows = [["", "x mm", "y mm", "z mm", "qw", "qx", "qy", "qz", "confidence"]]
-    for number, found in enumerate(answer.detections, 1):
-        position = [f"{1000 * value:.1f}" for value in found.camera_from_part[:3, 3]]
-        turn = [f"{value:.4f}" for value in quaternion_from_matrix(found.camera_from_part[:3, :3])]
-        rows.append([str(number), *position, *turn, f"{found.confidence:.3f}"])
+    for number, detection in enumerate(answer.detections, 1):
+        position = [f"{1000 * value:.1f}" for value in detection.camera_from_part[:3, 3]]
+        turn = [f"{value:.4f}" for value in quaternion_from_matrix(detection.camera_from_part[:3, :3])]
+        rows.append([str(number), *position, *turn, f"{detection.confidence:.3f}"])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     count = len(answer.detections)
-    said = f"{answer.part}: {count} pose{'s' * (count > 1)} in the camera frame"
-    return "\n".join([said, *lines, facts])
+    summary = f"{answer.part}: {count} pose{'s' * (count > 1)} in the camera frame"
+    return "\n".join([summary, *lines, facts])
 
 
 def _verify_bundle(options: argparse.Namespace) -> int:
@@ -236,8 +236,8 @@ def _verify_bundle(options: argparse.Namespace) -> int:
     trusted = _trusted(options)
     bundle = load_bundle(options.path, trusted)
     clouds = len(bundle.golden())
-    said = "signature not checked" if trusted is None else "signature holds"
-    said += f", every hash holds, golden clouds: {clouds}"
+    report = "signature not checked" if trusted is None else "signature holds"
+    report += f", every hash holds, golden clouds: {clouds}"
     if options.self_test:
         from attentionvote.inference.estimator import PoseEstimator
         from attentionvote.inference.golden import self_test
@@ -246,8 +246,8 @@ def _verify_bundle(options: argparse.Namespace) -> int:
             if problems := self_test(estimator, bundle):
                 more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
                 raise BundleError(f"{options.path}: {problems[0]}{more}")
-        said += ", all of them reproduced"
-    print(f"{options.path}: {bundle.card.part.name}, bundle {bundle.digest[:12]}: {said}")
+        report += ", all of them reproduced"
+    print(f"{options.path}: {bundle.card.part.name}, bundle {bundle.digest[:12]}: {report}")
     return OK
 
 

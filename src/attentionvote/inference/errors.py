@@ -1,4 +1,4 @@
-"""What the cell refuses, in one sentence each: bad input, a bundle it cannot trust, an answer that came too late."""
+"""The cell's refusals, in one sentence each: bad input, a bundle it cannot trust, an answer that came too late."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ class RegistryError(BundleError):
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """``, did you mean 'x'?`` when one of the valid names is close, else nothing."""
-    found = difflib.get_close_matches(name[:_LONGEST_NAME], list(valid), n=1, cutoff=0.5)
-    return f", did you mean {found[0]!r}?" if found else ""
+    near = difflib.get_close_matches(name[:_LONGEST_NAME], list(valid), n=1, cutoff=0.5)
+    return f", did you mean {near[0]!r}?" if near else ""

@@ -139,7 +139,7 @@ class PoseEstimator:
             cloud = _cloud(points, depth, camera)
             with _naming_the_camera(depth is not None):
                 scan = measured_points(cloud, self.card, self._most_points)
-                facts["points_given"] = scan.given if depth is None else depth.size
+                facts["points_given"] = scan.total if depth is None else depth.size
                 facts["points_measured"] = scan.measured
                 facts["warnings"] = (*scan.warnings, *_sparse(facts, crop))
                 clock.lap("read")
@@ -215,9 +215,9 @@ def _naming_the_camera(from_depth: bool) -> Iterator[None]:
 
 def _sparse(facts: Mapping[str, Any], crop: Crop | None) -> Iterator[str]:
     """A warning when most places have no measurement; with a bin that is looked at more closely."""
-    given, measured = facts["points_given"], facts["points_measured"]
-    if crop is None and measured < LEAST_SHARE * given:
-        yield f"only {measured} of {given} places have a measurement"
+    total, measured = facts["points_given"], facts["points_measured"]
+    if crop is None and measured < LEAST_SHARE * total:
+        yield f"only {measured} of {total} places have a measurement"
 
 
 def _cloud(

@@ -84,28 +84,28 @@ def _errors_by_part(
     rotation = translation.copy()
     for kind, symmetry in enumerate(symmetries):
         pairs = np.ix_(cloud.part_ids == kind, named == kind)
-        own = cloud.camera_from_part[cloud.part_ids == kind], poses[named == kind]
-        translation[pairs], rotation[pairs] = pose_errors(*own, symmetry)
+        of_part = cloud.camera_from_part[cloud.part_ids == kind], poses[named == kind]
+        translation[pairs], rotation[pairs] = pose_errors(*of_part, symmetry)
     return translation, rotation
 
 
 def _missing(cloud: GoldenCloud, index: int, translation: NDArray[np.float64], rotation: NDArray[np.float64]) -> str:
-    said = f"golden cloud {cloud.name} must give pose {index} with confidence {cloud.confidence[index]:.2f} again"
+    demand = f"golden cloud {cloud.name} must give pose {index} with confidence {cloud.confidence[index]:.2f} again"
     if not np.isfinite(translation).any():
-        return f"{said}, but gave no pose {'under its name' if len(translation) else 'at all'}"
+        return f"{demand}, but gave no pose {'under its name' if len(translation) else 'at all'}"
     nearest = int(np.argmin(translation))
     return (
-        f"{said} within 1 mm and 1 degree, but the nearest is off by {1000 * translation[nearest]:.2f} mm "
+        f"{demand} within 1 mm and 1 degree, but the nearest is off by {1000 * translation[nearest]:.2f} mm "
         f"and {math.degrees(rotation[nearest]):.2f} degrees"
     )
 
 
 def pose_errors(
-    expected: NDArray[np.float64], found: NDArray[np.float64], symmetry: Symmetry
+    expected: NDArray[np.float64], actual: NDArray[np.float64], symmetry: Symmetry
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distances in metres and angles in radians ``(E, F)`` between poses ``(E, 4, 4)`` and ``(F, 4, 4)``.
 
     Angles are least over the symmetries; for a body of revolution between the axes, of at most 90 degrees with flip.
     """
-    translation = np.linalg.norm(expected[:, None, :3, 3] - found[None, :, :3, 3], axis=-1)
-    return translation, symmetry.angle(expected[:, None, :3, :3], found[None, :, :3, :3])
+    translation = np.linalg.norm(expected[:, None, :3, 3] - actual[None, :, :3, 3], axis=-1)
+    return translation, symmetry.angle(expected[:, None, :3, :3], actual[None, :, :3, :3])

@@ -22,13 +22,13 @@ class MeasuredPoints(NamedTuple):
 
     Attributes:
         points: ``(P, 3)`` float32 metres, camera frame, all finite.
-        given: places of the cloud, missing measurements included.
+        total: places of the cloud, missing measurements included.
         measured: places with a measurement, strays included.
         warnings: sentences about what was left out.
     """
 
     points: NDArray[np.float32]
-    given: int
+    total: int
     measured: int
     warnings: tuple[str, ...]
 

@@ -107,7 +107,7 @@ def prepare(
     warnings = check_scene(cloud, card)
     rng = np.random.default_rng(seed)
     dense = cloud if len(cloud) <= card.density else cloud[sample_indices(len(cloud), card.density, rng)]
-    chosen = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])
+    sample = np.ascontiguousarray(dense[sample_indices(len(dense), card.points, rng)])
     between()
-    normals = estimate_normals(dense, chosen, card.normal_neighbors, make=False)
-    return Prepared(chosen[None], normals[None], len(cloud), warnings)
+    normals = estimate_normals(dense, sample, card.normal_neighbors, make=False)
+    return Prepared(sample[None], normals[None], len(cloud), warnings)

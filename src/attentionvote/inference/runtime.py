@@ -85,8 +85,8 @@ class Session:
         _check_tensors("input", self._session.get_inputs(), card.inputs)
         _check_tensors("output", self._session.get_outputs(), card.outputs)
         optional = {node.name for node in self._session.get_overridable_initializers()}
-        said = self._session.get_modelmeta().custom_metadata_map.get(LAYOUT_KEY)
-        self.layout: dict[str, Any] | None = json.loads(said) if said and optional >= set(FOUND) else None
+        layout = self._session.get_modelmeta().custom_metadata_map.get(LAYOUT_KEY)
+        self.layout: dict[str, Any] | None = json.loads(layout) if layout and optional >= set(FOUND) else None
         self._inputs = card.inputs
         self._outputs = [spec.name for spec in card.outputs]
 
@@ -95,14 +95,14 @@ class Session:
         points: NDArray[np.float32],
         normals: NDArray[np.float32],
         deadline_s: float | None = None,
-        found: Sequence[NDArray[np.int64]] = (),
+        neighbors: Sequence[NDArray[np.int64]] = (),
     ) -> dict[str, NDArray[np.float32]]:
         """The graph's outputs by name.
 
         Args:
             points, normals: ``(1, N, 3)`` float32.
             deadline_s: seconds from now; the graph is stopped when they have passed. None: it runs to its end.
-            found: farthest-point order and neighbours as ``layout`` says; the graph finds them where there are none.
+            neighbors: farthest-point order and neighbours as ``layout`` says; without them the graph finds its own.
 
         Raises:
             ValueError: when an input has another shape or type.
@@ -116,7 +116,7 @@ class Session:
                 raise ValueError(
                     f"{spec.name} must be float32 of shape {spec.shape}, got {array.dtype} of shape {array.shape}"
                 )
-        feed |= dict(zip(FOUND, found, strict=False))
+        feed |= dict(zip(FOUND, neighbors, strict=False))
         start = time.monotonic()
         if deadline_s is not None and not deadline_s > 0:
             raise DeadlineExceeded("the deadline had passed before the graph was started")
@@ -145,10 +145,10 @@ def _stop(options: onnxruntime.RunOptions) -> None:
     options.terminate = True
 
 
-def _check_tensors(kind: str, found: list[onnxruntime.NodeArg], expected: tuple[TensorSpec, ...]) -> None:
+def _check_tensors(kind: str, nodes: list[onnxruntime.NodeArg], expected: tuple[TensorSpec, ...]) -> None:
     """The graph's tensors must be the card's, in their order."""
-    actual = {node.name: (tuple(node.shape), node.type) for node in found}
-    if [node.name for node in found] != [spec.name for spec in expected]:
+    actual = {node.name: (tuple(node.shape), node.type) for node in nodes}
+    if [node.name for node in nodes] != [spec.name for spec in expected]:
         raise BundleError(
             f"model.onnx must have the {kind}s {', '.join(spec.name for spec in expected)}; "
             f"got {', '.join(actual) or 'none'}: export the bundle again"

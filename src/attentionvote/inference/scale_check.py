@@ -36,14 +36,14 @@ class _Scale(NamedTuple):
     """How a cloud compares with the model's scenes.
 
     Attributes:
-        said: the comparison in words.
+        comparison: with the scenes that the model knows, in words.
         depth: factor by which its median depth lies beyond the farthest (above 1) or before the nearest (below 1).
         extent: its largest side as a multiple of a scene's.
         question: what may have happened.
         upright: whether it seems to be in a frame whose z points up: of the right size, but beside the camera's view.
     """
 
-    said: str
+    comparison: str
     depth: float
     extent: float
     question: str
@@ -71,29 +71,29 @@ def check_scene(cloud: NDArray[np.float32], card: ModelCard) -> tuple[str, ...]:
     scale = _scale(cloud, card)
     _refuse_depth(scale, REFUSED_FACTOR)
     if scale.extent >= REFUSED_FACTOR:
-        raise InputError(f"points must be of the bin only: {scale.said}: crop the cloud (`bin` in the cell file)")
+        raise InputError(f"points must be of the bin only: {scale.comparison}: crop the cloud (`bin` in the cell file)")
     warnings = []
     if not 1 / WARNED_FACTOR < scale.depth < WARNED_FACTOR:
-        warnings.append(f"the scene lies {'farther' if scale.depth > 1 else 'nearer'} than trained: {scale.said}")
+        warnings.append(f"the scene lies {'farther' if scale.depth > 1 else 'nearer'} than trained: {scale.comparison}")
     if scale.extent > WARNED_FACTOR:
-        warnings.append(f"the scene is larger than trained: {scale.said}")
+        warnings.append(f"the scene is larger than trained: {scale.comparison}")
     return tuple(warnings)
 
 
 def _refuse_depth(scale: _Scale, factor: float) -> None:
     if scale.upright:
         raise InputError(
-            f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.said}: "
+            f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.comparison}: "
             "the cloud seems to be in a robot's or the world's frame with z up, "
             "transform it by the inverse of the camera's pose"
         )
     if scale.depth <= 0:
         raise InputError(
-            f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.said}: "
+            f"points must lie before the camera, in its frame (x right, y down, z forward), but {scale.comparison}: "
             "transform them into the camera frame, or turn y and z round when they come from OpenGL"
         )
     if not 1 / factor < scale.depth < factor:
-        raise InputError(f"points must be metres: {scale.said}: {scale.question}")
+        raise InputError(f"points must be metres: {scale.comparison}: {scale.question}")
 
 
 def _scale(cloud: NDArray[np.float32], card: ModelCard) -> _Scale:
@@ -104,7 +104,7 @@ def _scale(cloud: NDArray[np.float32], card: ModelCard) -> _Scale:
     low, middle, high = np.percentile(axes, [1, 50, 99], axis=1)
     wide, deep = float((high - low)[:2].max()), float(middle[2])
     near, far = card.distance
-    said = (
+    comparison = (
         f"the cloud is {wide:.4g} wide and {deep:.4g} deep, "
         f"the model knows scenes {card.extent:.3g} m wide at {near:.3g}..{far:.3g} m"
     )
@@ -112,7 +112,7 @@ def _scale(cloud: NDArray[np.float32], card: ModelCard) -> _Scale:
     extent = float((high - low).max()) / card.extent
     beside = math.hypot(middle[0], middle[1]) > _STEEPEST * abs(deep)
     upright = 1 / _LIKE_SIZE < extent < _LIKE_SIZE and (abs(deep) < near / _FLAT or beside)
-    return _Scale(said, depth, extent, _question(deep / math.sqrt(near * far)), upright)
+    return _Scale(comparison, depth, extent, _question(deep / math.sqrt(near * far)), upright)
 
 
 def _question(factor: float) -> str:

@@ -57,10 +57,10 @@ class MemberTask:
     def _run(self, verb: str, words: list[str], name: str) -> Any:
         script = self.scripts / f"{verb}.py"
         if self.logs is None:
-            return JobProcess(script, words, environment=self.environment).wait()
+            return JobProcess(script, words, environment=self.environment).result()
         self.logs.mkdir(parents=True, exist_ok=True)
         with (self.logs / f"{name}-{verb}.log").open("ab") as log:
-            return JobProcess(script, words, log, self.environment).wait()
+            return JobProcess(script, words, log, self.environment).result()
 
 
 def words_of_verbs(

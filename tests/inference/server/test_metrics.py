@@ -31,7 +31,7 @@ def test_the_reason_is_readable_and_alone(sentence: str) -> None:
 def test_one_model_serves() -> None:
     metrics = Metrics()
     for version in ("aa", "bb"):
-        metrics.serving("gear", version, version * 32, kept=version == "aa", last_known_good=version == "bb")
+        metrics.serving("gear", version, version * 32, saved=version == "aa", last_known_good=version == "bb")
     found = samples(metrics)
     assert [key[1:] for key in found if key[0] == "attentionvote_model_info"] == [("bb" * 32, "gear", "bb")]
     assert found["attentionvote_last_known_good_kept",] == 0.0

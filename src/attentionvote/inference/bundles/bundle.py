@@ -116,7 +116,7 @@ def load_bundle(path: Path | str, trusted: Trusted) -> Bundle:
         unlisted = sorted(set(files_in(handle, folder)) - set(entries) - {MANIFEST, SIGNATURE})
         if unlisted:
             raise BundleError(f"{folder}: {unlisted[0]} is not in {MANIFEST}: remove it, or export the bundle again")
-        kept = {}
+        contents = {}
         for name, entry in sorted(entries.items(), key=lambda item: item[1].bytes):
             content = read_file(handle, name, most_bytes(name), folder)
             if len(content) != entry.bytes:
@@ -130,10 +130,10 @@ def load_bundle(path: Path | str, trusted: Trusted) -> Bundle:
                     "copy or export the bundle again"
                 )
             if name in (MODEL, CARD) or name.startswith(f"{GOLDEN}/"):
-                kept[name] = content
-    card = _card(folder, kept.pop(CARD), kept[MODEL])
-    model = kept.pop(MODEL)
-    return Bundle(folder, card, hashlib.sha256(manifest).hexdigest(), model, kept)
+                contents[name] = content
+    card = _card(folder, contents.pop(CARD), contents[MODEL])
+    model = contents.pop(MODEL)
+    return Bundle(folder, card, hashlib.sha256(manifest).hexdigest(), model, contents)
 
 
 def _card(folder: Path, content: bytes, model: bytes) -> ModelCard:

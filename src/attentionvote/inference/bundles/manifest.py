@@ -161,7 +161,7 @@ def files_in(handle: int, folder: Path, below: str = "", depth: int = 1) -> list
     Raises:
         BundleError: on symbolic links, devices, too deep or too many files.
     """
-    found: list[str] = []
+    names: list[str] = []
     for entry in sorted(os.scandir(handle), key=lambda entry: entry.name):
         name = below + entry.name
         if entry.is_symlink():
@@ -171,16 +171,16 @@ def files_in(handle: int, folder: Path, below: str = "", depth: int = 1) -> list
                 raise BundleError(f"{folder}: {name} lies too deep for a bundle: remove it or export again")
             inner = _open(handle, entry.name, os.O_DIRECTORY, name, folder)
             try:
-                found += files_in(inner, folder, f"{name}/", depth + 1)
+                names += files_in(inner, folder, f"{name}/", depth + 1)
             finally:
                 os.close(inner)
         elif entry.is_file(follow_symlinks=False):
-            found.append(name)
+            names.append(name)
         else:
             raise BundleError(f"{folder}: {name} must be a plain file, got a device or pipe: {_AGAIN}")
-        if len(found) > MOST_FILES + 2:
+        if len(names) > MOST_FILES + 2:
             raise BundleError(f"{folder} must hold at most {MOST_FILES} files, got more: is it a bundle's folder?")
-    return found
+    return names
 
 
 def read_file(handle: int, name: str, most: int, folder: Path) -> bytes:

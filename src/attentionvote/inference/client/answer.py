@@ -1,4 +1,4 @@
-"""What a client gets: poses or their absence, decoded from binary tensors, or one of a few kinds of errors."""
+"""A client's answer: poses or their absence, decoded from binary tensors, or one of a few kinds of errors."""
 
 from __future__ import annotations
 
@@ -111,21 +111,21 @@ def decode_answer(body: bytes, header_length: str | None) -> Answer:
             else:
                 values = np.frombuffer(piece, dtype=_DTYPES[output["datatype"]])
                 tensors[output["name"]] = values.reshape(output["shape"])
-        said = content["parameters"]
+        parameters = content["parameters"]
         n = len(tensors["confidence"])
         return Answer(
             tensors["camera_from_part"],
             tensors["confidence"],
             tensors["heat"],
             tensors.get("class_index", np.zeros(n, np.int64)),
-            (str(said["part"]),) * n if names is None else names,
-            status=str(said["status"]),
-            message=str(said["message"]),
-            warnings=str(said["warnings"]),
-            part=str(said["part"]),
+            (str(parameters["part"]),) * n if names is None else names,
+            status=str(parameters["status"]),
+            message=str(parameters["message"]),
+            warnings=str(parameters["warnings"]),
+            part=str(parameters["part"]),
             version=str(content["model_version"]),
-            frame=str(said["frame"]),
-            units=str(said["units"]),
+            frame=str(parameters["frame"]),
+            units=str(parameters["units"]),
         )
     except (ValueError, KeyError, TypeError, IndexError, struct.error) as error:
         raise ServerFailed(f"the answer must hold poses as binary tensors, but it cannot be read ({error})") from error

@@ -1,4 +1,4 @@
-"""Where the registry is and who asks: its address and the credentials, which no message and no address ever shows."""
+"""Access to the registry: its address and the credentials, which no message and no address ever shows."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ def access(options: argparse.Namespace) -> Access:
     if not user and not password:
         return Access(address)
     if not user or not password:
-        given, missing = (USER_VARIABLE, PASSWORD_VARIABLE) if user else (PASSWORD_VARIABLE, USER_VARIABLE)
+        present, missing = (USER_VARIABLE, PASSWORD_VARIABLE) if user else (PASSWORD_VARIABLE, USER_VARIABLE)
         raise InputError(
-            f"{USER_VARIABLE} and {PASSWORD_VARIABLE} must be set together, got {given} only: set {missing}"
+            f"{USER_VARIABLE} and {PASSWORD_VARIABLE} must be set together, got {present} only: set {missing}"
         )
     return Access(address, _basic(user, password))
 

@@ -31,7 +31,7 @@ from attentionvote.inference.fetching.registry import Registry
 
 LATEST = "latest"
 DIGITS = 12  # of the digest in a folder's name
-KEPT = 2
+COPIES = 2
 
 
 class FetchedBundles:
@@ -103,7 +103,7 @@ class FetchedBundles:
                 self._fetch(registry, version, target)
             self._record.add(version, keep=serving)
             self._point(version)
-            self._prune({*self._record.digests()[:KEPT], *serving})
+            self._prune({*self._record.digests()[:COPIES], *serving})
         return target, fetched
 
     def _check_pin(self, version: RegistryVersion) -> None:
@@ -156,10 +156,10 @@ class FetchedBundles:
 
     def _prune(self, keep: Collection[str]) -> None:
         """Remove what was fetched here once and is not kept; whatever else lies in the folder is not ours."""
-        kept = {digest[:DIGITS] for digest in keep}
+        names = {digest[:DIGITS] for digest in keep}
         for digest in self._record.digests():
             old = self.folder / digest[:DIGITS]
-            if old.name not in kept and old.is_dir():
+            if old.name not in names and old.is_dir():
                 self._whole.discard(digest)
                 gone = Path(tempfile.mkdtemp(prefix="fetching-", dir=self.folder))
                 with contextlib.suppress(OSError):

@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
         folder, fetched = bundles.take(registry, version)
     except OSError as error:
         raise BundleError(f"{options.to} must take the bundle, but it cannot be written: {error.strerror}") from error
-    said = "fetched and verified" if fetched else "already there and verified"
-    print(f"attentionvote: {reference} is {version}, bundle {version.digest[:DIGITS]}, {said}", file=sys.stderr)
+    state = "fetched and verified" if fetched else "already there and verified"
+    print(f"attentionvote: {reference} is {version}, bundle {version.digest[:DIGITS]}, {state}", file=sys.stderr)
     print(folder)
     return 0

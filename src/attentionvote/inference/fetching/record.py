@@ -1,4 +1,4 @@
-"""What a registry once said each fetched bundle is: how a cell knows its versions when the registry is away."""
+"""The record of fetched bundles and their versions: how a cell knows them when the registry is away."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class FetchRecord:
 
     def versions(self) -> list[RegistryVersion]:
         """The versions of the reference, newest first; of a pin at most one."""
-        own = [version for asked, version in reversed(self._entries) if asked == str(self._reference)]
+        versions = [version for asked, version in reversed(self._entries) if asked == str(self._reference)]
         if self._reference.version is None:
-            return own
+            return versions
         same = (self._reference.name, self._reference.version)
-        return [*own, *(version for _, version in reversed(self._entries) if version[:2] == same)][:1]
+        return [*versions, *(version for _, version in reversed(self._entries) if version[:2] == same)][:1]
 
     def newest(self) -> RegistryVersion | None:
         """The version that the reference named last."""
@@ -66,7 +66,7 @@ class FetchRecord:
             return
         entries = [other for other in self._entries if other != entry] + [entry]
         entries = [e for e in entries[:-_MOST_ENTRIES] if e[1].digest in keep] + entries[-_MOST_ENTRIES:]
-        content = [{"reference": asked, **found._asdict()} for asked, found in entries]
+        content = [{"reference": asked, **version._asdict()} for asked, version in entries]
         new = self._folder / f"fetching-{NAME}"
         with new.open("w", encoding="utf-8") as file:
             json.dump({"format": _FORMAT, "bundles": content}, file, indent=1)

@@ -1,4 +1,4 @@
-"""How a model in a registry is named: ``models:/NAME@ALIAS`` follows an alias, ``models:/NAME/VERSION`` is a pin."""
+"""The name of a model in a registry: ``models:/NAME@ALIAS`` follows an alias, ``models:/NAME/VERSION`` is a pin."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def parse_reference(text: str) -> Reference:
     Raises:
         InputError: when it is neither, with the nearest that is.
     """
-    found = _REFERENCE.fullmatch(text)
-    if found and not (found[2] and _NO_ALIAS.fullmatch(found[2])):
-        return Reference(found[1], found[2], found[3])
+    match = _REFERENCE.fullmatch(text)
+    if match and not (match[2] and _NO_ALIAS.fullmatch(match[2])):
+        return Reference(match[1], match[2], match[3])
     raise InputError(
         f"a registry's model must be models:/NAME@ALIAS or models:/NAME/VERSION, got {text[:200]!r}{_nearest(text)}"
     )

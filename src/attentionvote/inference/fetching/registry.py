@@ -93,9 +93,9 @@ class Registry:
         except _Absent:
             raise RegistryError(self._absent(reference)) from None
         try:
-            found = content["model_version"]
-            name, version = str(found["name"]), str(found["version"])
-            tags = {str(tag["key"]): str(tag.get("value", "")) for tag in found.get("tags", [])}
+            entry = content["model_version"]
+            name, version = str(entry["name"]), str(entry["version"])
+            tags = {str(tag["key"]): str(tag.get("value", "")) for tag in entry.get("tags", [])}
         except (KeyError, TypeError, AttributeError) as error:
             raise RegistryError(self._no_registry()) from error
         if name != reference.name or reference.version not in (None, version):
@@ -211,9 +211,9 @@ class Registry:
         try:
             model = self._json("registered-models/get", {"name": reference.name})["registered_model"]
             if reference.alias is not None:
-                known = [str(entry["alias"]) for entry in model.get("aliases", [])]
+                aliases = [str(entry["alias"]) for entry in model.get("aliases", [])]
                 missing = f"{reference.name} must have the alias {reference.alias}, but there is none"
-                return missing + _choice(reference.alias, known, "give it one with `make promote`")
+                return missing + _choice(reference.alias, aliases, "give it one with `make promote`")
             query = {"filter": f"name = '{reference.name}'", "max_results": "100", "order_by": "version_number DESC"}
             versions = self._json("model-versions/search", query).get("model_versions", [])
             missing = f"{reference.name} must have a version {reference.version}, but there is none"
@@ -223,16 +223,16 @@ class Registry:
         except (KeyError, TypeError, AttributeError):
             return f"the registry {self.url} has no {reference}"
         try:
-            found = self._json("registered-models/search", {"max_results": "100"}).get("registered_models", [])
+            registered = self._json("registered-models/search", {"max_results": "100"}).get("registered_models", [])
             return models + _choice(
-                reference.name, [str(entry["name"]) for entry in found], "make one with `make promote`"
+                reference.name, [str(entry["name"]) for entry in registered], "make one with `make promote`"
             )
         except (_Absent, KeyError, TypeError, AttributeError):
             return models
 
 
-def _choice(wanted: str, known: Iterable[str], otherwise: str) -> str:
-    names = list(known)
+def _choice(wanted: str, candidates: Iterable[str], otherwise: str) -> str:
+    names = list(candidates)
     if not names:
         return f": {otherwise}"
     near = difflib.get_close_matches(wanted, names, n=1, cutoff=0.5)

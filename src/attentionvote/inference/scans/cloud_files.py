@@ -16,7 +16,7 @@ from attentionvote.inference.scans.file_bytes import Content, content_view
 from attentionvote.inference.scans.limits import Budget
 from attentionvote.inference.scans.missing_points import cloud_of
 from attentionvote.inference.scans.other_kinds import other_kind
-from attentionvote.inference.scans.sentences import one_line
+from attentionvote.inference.scans.sentences import single_line
 from attentionvote.inference.scans.text_cloud import points_from_text, text_rows_start
 
 _COLUMNS = (3, 4, 6)  # x y z; and an intensity; and a normal or a colour
@@ -40,11 +40,11 @@ def read_cloud(source: Path | str | Content, name: str = "", *, budget: Budget |
     try:
         cloud = _cloud(content, budget or Budget())
         if cloud is None:
-            raise InputError(one_line(_unknown(content, name)))
+            raise InputError(single_line(_unknown(content, name)))
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(one_line(f"{name} must be a point cloud, but {error}")) from error
+        raise InputError(single_line(f"{name} must be a point cloud, but {error}")) from error
     return cloud
 
 

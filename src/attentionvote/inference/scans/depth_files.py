@@ -18,7 +18,7 @@ from attentionvote.inference.scans.file_bytes import Content, content_view
 from attentionvote.inference.scans.limits import MOST_PIXELS, Budget
 from attentionvote.inference.scans.other_kinds import other_kind
 from attentionvote.inference.scans.png_depth import PNG_MAGIC, depth_from_png
-from attentionvote.inference.scans.sentences import one_line
+from attentionvote.inference.scans.sentences import single_line
 
 __all__ = ["PNG_MAGIC", "CameraIntrinsics", "read_depth"]
 
@@ -129,7 +129,7 @@ def read_depth(source: Path | str | Content, name: str = "", *, budget: Budget |
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(one_line(f"{name} must be a depth image (H, W), but {error}")) from error
+        raise InputError(single_line(f"{name} must be a depth image (H, W), but {error}")) from error
     kind = other_kind(content, name) or "another kind of file"
     raise InputError(f"{name} must be a 16-bit PNG or a .npy file with a depth image, got {kind}")
 
@@ -138,7 +138,7 @@ def _from_npy(content: memoryview, name: str, budget: Budget) -> NDArray[Any]:
     image = array_from_npy(content)
     if image.ndim != 2 or image.dtype.names is not None:
         fields = f" of {image.dtype}" if image.dtype.names is not None else ""
-        raise InputError(one_line(f"{name} must be a depth image (H, W), got shape {image.shape}{fields}"))
+        raise InputError(single_line(f"{name} must be a depth image (H, W), got shape {image.shape}{fields}"))
     if image.size > MOST_PIXELS:
         raise InputError(f"{name} must have 1 to {MOST_PIXELS} pixels, got {image.shape[1]} x {image.shape[0]}")
     budget.take(image.nbytes)

@@ -1,4 +1,4 @@
-"""What reading one input file may cost, whatever its kind: bytes it unpacks to, entries, and processor seconds."""
+"""Limits of reading one input file, whatever its kind: bytes it unpacks to, entries, and processor seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the header of a .npy file says, without evaluating it as Python, which is what numpy does."""
+"""The header of a .npy file, read without evaluating it as Python, which is what numpy does."""
 
 from __future__ import annotations
 

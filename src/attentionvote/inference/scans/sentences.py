@@ -5,7 +5,7 @@ from __future__ import annotations
 _MOST_CHARACTERS = 600
 
 
-def one_line(sentence: str) -> str:
+def single_line(sentence: str) -> str:
     """A sentence without line ends and control characters, of at most 600 characters."""
     if len(sentence) > _MOST_CHARACTERS:
         sentence = sentence[: _MOST_CHARACTERS - 1] + "…"

@@ -1,4 +1,4 @@
-"""Who may call: the API token from a file, and the rule that without one only this machine may."""
+"""Access to the server: the API token from a file, and the rule that without one only this machine may."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Tokens:
     def accept(self, authorization: str | None) -> bool:
         """Whether an ``Authorization`` header carries a token; the time does not depend on how much of it is right."""
         scheme, _, token = (authorization or "").partition(" ")
-        given = hashlib.sha256(token.strip().encode("latin-1", "replace")).digest()
-        matches = [hmac.compare_digest(given, known) for known in self._hashes]
+        digest = hashlib.sha256(token.strip().encode("latin-1", "replace")).digest()
+        matches = [hmac.compare_digest(digest, valid) for valid in self._hashes]
         return scheme.lower() == "bearer" and any(matches)
 
 

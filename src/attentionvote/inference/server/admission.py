@@ -1,4 +1,4 @@
-"""Who may wait: a bounded number of requests, each with a deadline that starts when its first byte arrives.
+"""Admission of requests: a bounded number of requests, each with a deadline that starts when its first byte arrives.
 
 A request takes its place when its body is there (``reception``), so that nobody holds one who only drips. The place is
 free again when the work has ended, not when the answer was sent: an answer may be early (the deadline), the worker is
@@ -44,8 +44,8 @@ def too_late(deadline: Deadline, doing: str) -> Refusal:
     return Refusal(504, sentence, "deadline", content=late_answer(sentence))
 
 
-class Place:
-    """A request's place; :meth:`leave` may be called more than once."""
+class Admission:
+    """A request's place among those that run or wait; :meth:`leave` may be called more than once."""
 
     def __init__(self, gate: Gate) -> None:
         self._gate: Gate | None = gate
@@ -86,7 +86,7 @@ class Gate:
                 {"Retry-After": str(max(1, math.ceil(self._typical_s))), RETRY_HEADER: f"{self._typical_s * 1e3:.0f}"},
             )
 
-    def enter(self) -> Place:
+    def enter(self) -> Admission:
         """Take a place.
 
         Raises:
@@ -95,10 +95,10 @@ class Gate:
         self.check()
         self._inside += 1
         self._metrics.waiting.set(self._inside)
-        return Place(self)
+        return Admission(self)
 
     def release(self) -> None:
-        """A place is free again; called by :class:`Place`."""
+        """A place is free again; called by :class:`Admission`."""
         self._inside -= 1
         self._metrics.waiting.set(self._inside)
 

@@ -13,7 +13,7 @@ from typing import Any
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
-from attentionvote.inference.server.admission import Gate, Place, deadline_from_header, too_late
+from attentionvote.inference.server.admission import Admission, Gate, deadline_from_header, too_late
 from attentionvote.inference.server.deadline import Deadline
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.serving import Served, Serving
@@ -95,7 +95,7 @@ class Answering:
         self.gate.check()
         content = await self.reception.body(request, deadline)
         try:
-            place = self.gate.enter()
+            admission = self.gate.enter()
         except BaseException:
             content.close()
             raise
@@ -106,10 +106,10 @@ class Answering:
             work = _Work(served, {**job, "most_deadline_ms": limits.most_deadline_ms}, content, deadline, record)
             future = self.serving.submit(work.run)
         except BaseException:
-            place.leave()
+            admission.leave()
             content.close()
             raise
-        _leave_when_done(place, content, served, future)
+        _leave_when_done(admission, content, served, future)
         answer = await self._wait(request, future, deadline)
         for stage in ("queue", "parse", "estimate"):
             if stage in record.seconds:
@@ -203,7 +203,7 @@ async def _disconnected(request: Request) -> None:
         pass
 
 
-def _leave_when_done(place: Place, content: SharedContent, served: Served, future: Future[Message]) -> None:
+def _leave_when_done(admission: Admission, content: SharedContent, served: Served, future: Future[Message]) -> None:
     """Free place, body and workers when the work has ended, in whichever thread that is."""
     loop = asyncio.get_running_loop()
 
@@ -211,6 +211,6 @@ def _leave_when_done(place: Place, content: SharedContent, served: Served, futur
         content.close()
         served.workers.release()
         with suppress(RuntimeError):  # the loop has ended: the server is gone
-            loop.call_soon_threadsafe(place.leave)
+            loop.call_soon_threadsafe(admission.leave)
 
     future.add_done_callback(leave)

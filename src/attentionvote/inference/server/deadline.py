@@ -1,4 +1,4 @@
-"""How long a request may take, from its first byte on; server and worker count it by the same clock."""
+"""The deadline of a request, from its first byte on; server and worker count it by the same clock."""
 
 from __future__ import annotations
 

@@ -57,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
         with opener.open(address, timeout=options.timeout_s) as response:
             content = json.loads(response.read(_MOST_BYTES))
         origin = content.get("registry")
-        said = f", version {origin['version']} of {origin['name']}" if origin else ""
-        print(f"ready: {content['model']} {content['version']}{said}")
+        registered = f", version {origin['version']} of {origin['name']}" if origin else ""
+        print(f"ready: {content['model']} {content['version']}{registered}")
         return 0
     except urllib.error.HTTPError as error:
         print(f"health: not ready ({error.code}): {_sentence(error.read(_MOST_BYTES))}", file=sys.stderr)

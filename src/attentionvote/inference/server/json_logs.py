@@ -63,5 +63,5 @@ def say(event: str, message: str = "", level: int = logging.INFO, *, trace: bool
         trace: add the traceback of the exception that is being handled.
         fields: further values of the line; None is left out.
     """
-    given = {name: value for name, value in fields.items() if value is not None}
-    LOGGER.log(level, message, exc_info=trace, extra={"event": event, "fields": given})
+    present = {name: value for name, value in fields.items() if value is not None}
+    LOGGER.log(level, message, exc_info=trace, extra={"event": event, "fields": present})

@@ -1,4 +1,4 @@
-"""What the cell can be watched by: Prometheus metrics in a registry of the server's own."""
+"""The cell's measurements: Prometheus metrics in a registry of the server's own."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Metrics:
             prefix + "serving_last_known_good", "1 while the copy of the last good bundle serves, not the given path",
             registry=self.registry,
         )  # fmt: skip
-        self.kept = Gauge(
+        self.saved = Gauge(
             prefix + "last_known_good_kept", "1 when the model that serves is also kept on disk for the next start",
             registry=self.registry,
         )  # fmt: skip
@@ -121,11 +121,11 @@ class Metrics:
         for outcome in RELOADS:
             self.reloads.labels(outcome)
 
-    def serving(self, part: str, version: str, digest: str, *, kept: bool, last_known_good: bool) -> None:
+    def serving(self, part: str, version: str, digest: str, *, saved: bool, last_known_good: bool) -> None:
         """Say which model serves from now on."""
         self.model.clear()
         self.model.labels(part, version, digest).set(1)
-        self.kept.set(kept)
+        self.saved.set(saved)
         self.from_last_known_good.set(last_known_good)
 
     def reload_problem(self, sentence: str | None) -> None:

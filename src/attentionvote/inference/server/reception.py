@@ -54,11 +54,11 @@ class Reception:
         if declared.isdecimal() and int(declared[:20]) > self._most_bytes:
             raise self._too_large(f"{declared[:20]}")
         content = SharedContent()
-        one: _Incoming | None = None
+        incoming: _Incoming | None = None
         try:
             async with asyncio.timeout(max(deadline.remaining_s(), 0.0)) as limit:
-                one = _Incoming(content, limit)
-                self._incoming.append(one)
+                incoming = _Incoming(content, limit)
+                self._incoming.append(incoming)
                 self._make_room()
                 async for chunk in request.stream():
                     if content.size + len(chunk) > self._most_bytes:
@@ -67,7 +67,7 @@ class Reception:
                     self._make_room()
         except TimeoutError:
             content.close()
-            if one is not None and one.gives_way:
+            if incoming is not None and incoming.gives_way:
                 raise Refusal(
                     503,
                     "the body must come as fast as others do, but many are on their way and this one takes longest: "
@@ -80,14 +80,14 @@ class Reception:
             content.close()
             raise
         finally:
-            if one is not None:
-                self._incoming.remove(one)
+            if incoming is not None:
+                self._incoming.remove(incoming)
         return content
 
     def _make_room(self) -> None:
         """Let the oldest give way while there are too many, or too much of them."""
-        staying = [one for one in self._incoming if not one.gives_way]
-        size = sum(one.content.size for one in staying)
+        staying = [incoming for incoming in self._incoming if not incoming.gives_way]
+        size = sum(incoming.content.size for incoming in staying)
         while len(staying) > MOST_AT_ONCE or size > _MOST_LARGE * self._most_bytes:
             oldest = staying.pop(0)
             size -= oldest.content.size

@@ -56,7 +56,7 @@ class RequestLog:
             await send(message)
 
         try:
-            self._check_place(scope)
+            self._check_connections(scope)
             self._check_host(headers)
             self._authorize(scope["path"], headers)
             await self._app(scope, receive, numbered)
@@ -78,7 +78,7 @@ class RequestLog:
                 await Refusal(500, sentence, "failed").response()(scope, receive, numbered)
         self._end(scope, record, identity, status, time.monotonic() - begun)
 
-    def _check_place(self, scope: Scope) -> None:
+    def _check_connections(self, scope: Scope) -> None:
         """A connection beyond the limit is there for questions about health."""
         most = scope["state"].get("most_connections")
         if most is not None and scope["path"] not in OPEN_PATHS:
@@ -103,10 +103,10 @@ class RequestLog:
     def _authorize(self, path: str, headers: Headers) -> None:
         if self._tokens is None or path in OPEN_PATHS:
             return
-        given = headers.get("authorization")
-        if not self._tokens.accept(given):
-            what = "another token" if (given or "").lower().startswith("bearer ") else "another scheme"
-            what = what if given is not None else "none"
+        authorization = headers.get("authorization")
+        if not self._tokens.accept(authorization):
+            what = "another token" if (authorization or "").lower().startswith("bearer ") else "another scheme"
+            what = what if authorization is not None else "none"
             raise Refusal(
                 401,
                 f"the header Authorization must be 'Bearer' and the token of the server's token file, got {what}",

@@ -1,4 +1,4 @@
-"""What was answered by each model, in the form of Triton's statistics."""
+"""Counts of answers by model, in the form of Triton's statistics."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def graph(material: Material, size: str) -> Contest:
         return answer
 
     def in_a_cell() -> dict[str, NDArray]:
-        return session.run(points, normals, found=find_neighbors(points, session.layout))
+        return session.run(points, normals, neighbors=find_neighbors(points, session.layout))
 
     def compare(fast: dict[str, NDArray], others: Mapping[str, Any]) -> str:
         shares, in_cell = [], others[CELL]

@@ -8,21 +8,19 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from attentionvote.command.conf_folder import SCRIPTS
-from attentionvote.execution.job_process import INTERRUPTED, JobProcess, Outcome, interrupt
+from attentionvote.execution.job_executors import JobExecutor
+from attentionvote.execution.job_process import INTERRUPTED, JobFuture, Outcome, cancel_all
 from attentionvote.files import is_locked
+from attentionvote.workflows.sweep.settings import PRUNED_AT, PRUNED_CODE
 from attentionvote.workflows.sweep.study import Ledger
-from attentionvote.workflows.sweep.trial_place import PRUNED_AT, PRUNED_CODE, log_of
 
 log = logging.getLogger("attentionvote.sweep")
-TRAIN = SCRIPTS / "train.py"
 _POLL_S = 0.1
 _LOCK_S = 1.0  # between looks at a lock that somebody else holds
 _ALIKE = 3  # new trials in a row that fail with one sentence: something is away, and it is not their settings
@@ -31,13 +29,12 @@ _HELD = "held"  # attribute of a trial that failed when the sweep stopped for th
 
 @dataclass
 class Running:
-    """A trial whose process runs; no two have the same ``slot``."""
+    """A trial whose training runs; no two have the same ``slot``."""
 
     trial: Trial
     directory: Path
     slot: int
-    process: JobProcess
-    files: ExitStack
+    job: JobFuture
     start_s: float = field(default_factory=time.monotonic)
 
 
@@ -56,33 +53,31 @@ class SweepDriver:
 
     Args:
         ledger: of the study.
+        jobs: what starts trainings.
         words: the words of the training with the given values of the searched settings.
         directory: the folder of that training.
-        environment: of the process of the trial of this number, in this slot of ``workers``.
+        environment: of the training of the trial of this number, in this slot of ``workers``.
         workers: most trials at a time.
         retries: how often a trial whose process died is taken up again.
-        heartbeat_s: between signs of life.
         logs: folder of what the trainings say.
         ended: called with every trial that has ended.
-        script: of the process.
     """
 
     def __init__(
         self,
         ledger: Ledger,
+        jobs: JobExecutor,
         words: Callable[[Mapping[str, Any]], Sequence[str]],
         directory: Callable[[Mapping[str, Any]], Path],
         environment: Callable[[int, int], Mapping[str, str]],
         workers: int,
         retries: int,
-        heartbeat_s: float,
         logs: Path,
         ended: Callable[[FrozenTrial], object],
-        script: Path = TRAIN,
     ) -> None:
-        self.ledger, self.words, self.directory, self.environment = ledger, words, directory, environment
-        self.workers, self.retries, self.heartbeat_s = workers, retries, heartbeat_s
-        self.logs, self.ended, self.script = logs, ended, script
+        self.ledger, self.jobs, self.words = ledger, jobs, words
+        self.directory, self.environment = directory, environment
+        self.workers, self.retries, self.logs, self.ended = workers, retries, logs, ended
         self.running: list[Running] = []
         self.lost: deque[FrozenTrial] = deque()
         self.waiting: deque[tuple[Trial, dict[str, Any], Path]] = deque()  # somebody else is at their training
@@ -97,8 +92,8 @@ class SweepDriver:
             tick: called ten times a second.
 
         Raises:
-            ValueError: when a sweep in another place is at this study, or when trials fail in a row with one sentence;
-                these are begun and not ended then, so that the next call takes them up.
+            ValueError: when a sweep in another place is at this study or has taken it over, or when trials fail in a
+                row with one sentence; these are begun and not ended then, so that the next call takes them up.
             KeyboardInterrupt: after the trials that run have ended orderly; they go on with the next call.
         """
         self.lost = deque(self.ledger.lost())
@@ -114,9 +109,7 @@ class SweepDriver:
                 self._beat()
                 tick()
         finally:
-            interrupt([running.process for running in self.running])
-            for running in self.running:
-                running.files.close()
+            cancel_all([running.job for running in self.running])
 
     def _start(self, total: int) -> None:
         if time.monotonic() - self._looked_s >= _LOCK_S:
@@ -148,20 +141,17 @@ class SweepDriver:
         if taken or len(self.running) >= self.workers:
             self.waiting.append((trial, values, directory))
             return
-        files = ExitStack()
-        stderr = files.enter_context(log_of(self.logs, trial.number).open("ab"))
+        self.ledger.check()  # where a sweep goes on after a pause, the training may be another's by now
         slot = min(set(range(self.workers)) - {running.slot for running in self.running})
-        process = JobProcess(self.script, self.words(values), stderr, self.environment(trial.number, slot))
-        self.running.append(Running(trial, directory, slot, process, files))
+        log_file = self.logs / f"trial_{trial.number:03d}.log"
+        job = self.jobs.submit(self.words(values), log_file, self.environment(trial.number, slot))
+        self.running.append(Running(trial, directory, slot, job))
 
     def _collect(self) -> None:
         for running in list(self.running):
-            outcome = running.process.poll()
-            if outcome is None:
-                continue
-            self.running.remove(running)
-            running.files.close()
-            self._judge(running, outcome)
+            if running.job.done():
+                self.running.remove(running)
+                self._judge(running, running.job.result())
 
     def _judge(self, running: Running, outcome: Outcome) -> None:
         trial, seconds = running.trial, round(time.monotonic() - running.start_s, 1)
@@ -182,7 +172,7 @@ class SweepDriver:
                 self._end(trial, running.directory, TrialState.COMPLETE, float(value), **about)
         elif outcome.code < 0 and self.ledger.crashed(trial) <= self.retries:
             log.warning("trial %d is taken up again: %s", trial.number, outcome.sentence)
-            trial.set_user_attr("seconds", about["seconds"])
+            self.ledger.note(trial, seconds=about["seconds"])
             self.lost.append(self.ledger.trials[trial.number])
         else:
             self._fail(Failing(trial, running.directory, outcome.sentence, about))
@@ -195,9 +185,9 @@ class SweepDriver:
         # Those held before do not count: were it their settings after all, the study would never get past them.
         if sum(_HELD not in f.trial.user_attrs for f in self.failing) < _ALIKE:
             return
-        for one in self.failing:
-            one.trial.set_user_attr(_HELD, one.reason)
-        numbers = ", ".join(str(one.trial.number) for one in self.failing)
+        for held in self.failing:
+            self.ledger.note(held.trial, **{_HELD: held.reason})
+        numbers = ", ".join(str(held.trial.number) for held in self.failing)
         raise ValueError(
             f"the sweep stops, because trials {numbers} failed in a row with the same sentence; the same command takes "
             f"them up again when its cause is gone: {failing.reason}"
@@ -205,22 +195,21 @@ class SweepDriver:
 
     def _settle(self) -> None:
         """Write down what failed: another trial ended otherwise, or there is none left."""
-        for one in self.failing:
-            self._end(one.trial, one.directory, TrialState.FAIL, reason=one.reason, **one.about)
+        for failing in self.failing:
+            self._end(failing.trial, failing.directory, TrialState.FAIL, reason=failing.reason, **failing.about)
         self.failing = []
 
     def _end(
         self, trial: Trial, directory: Path | None, state: TrialState, value: float | None = None, **about: Any
     ) -> None:
         # For whoever looks at the study with another tool; relative, as the settings are.
-        place = {} if directory is None else {"directory": os.fspath(directory)}
-        self.ledger.end(trial, state, value, **place, **about)
+        folder = {} if directory is None else {"directory": os.fspath(directory)}
+        self.ledger.end(trial, state, value, **folder, **about)
         self.ended(self.ledger.trials[trial.number])
 
     def _beat(self) -> None:
-        if time.monotonic() - self._beaten_s >= self.heartbeat_s:
-            begun = [running.trial for running in self.running] + [failing.trial for failing in self.failing]
-            self.ledger.beat(begun + [trial for trial, _, _ in self.waiting])
+        if time.monotonic() - self._beaten_s >= self.ledger.heartbeat_s:
+            self.ledger.beat()
             self._beaten_s = time.monotonic()
 
 

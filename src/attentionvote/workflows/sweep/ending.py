@@ -76,13 +76,13 @@ def report(
     values = {s.name: s.value(best.params[s.name]) for s in ledger.space}
     title = f"Trial {best.number} of the sweep {study}: val/ap {best.value:.4f}, best of {len(complete)}."
     text = experiment_text(base, values, title)
-    places = [folder / "best.yaml", folder.parent / "best.yaml"]
+    paths = [folder / "best.yaml", folder.parent / "best.yaml"]
     if save_as:
-        places.append(CONF / "experiment" / f"{save_as}.yaml")
-    for place in places:
-        write_whole(place, text)
-    parent.log_file("best.yaml", places[0])
-    log.info("best: trial %d, val/ap %.4f; its settings are in %s", best.number, best.value, places[-1])
+        paths.append(CONF / "experiment" / f"{save_as}.yaml")
+    for path in paths:
+        write_whole(path, text)
+    parent.log_file("best.yaml", paths[0])
+    log.info("best: trial %d, val/ap %.4f; its settings are in %s", best.number, best.value, paths[-1])
     return {
         "stage": "sweep",
         "object": part,
@@ -92,7 +92,7 @@ def report(
         "states": counts,
         "best": {"trial": best.number, "val_ap": best.value, "run_id": run_of(best), "values": values},
         "importance": {name: round(share, 4) for name, share in shares.items()},
-        "experiment": str(places[-1]),
+        "experiment": str(paths[-1]),
         "folder": str(folder),
         "failed": failed,
     }

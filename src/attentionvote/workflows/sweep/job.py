@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from optuna.trial import FrozenTrial, TrialState
 
+from attentionvote.command.conf_folder import SCRIPTS
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.command.executors import cluster_of, cores_of_a_job, executor_of
 from attentionvote.execution import RayCluster
 from attentionvote.execution.hardware import gpu_of_slot, visible_gpus
-from attentionvote.workflows.sweep.driver import TRAIN, SweepDriver
+from attentionvote.execution.job_executors import JobExecutor, LocalJobs, WorkerJobs
+from attentionvote.workflows.sweep.driver import SweepDriver
 from attentionvote.workflows.sweep.ending import report
 from attentionvote.workflows.sweep.progress import SweepProgress
 from attentionvote.workflows.sweep.report import experiment_text, run_of, write_table
-from attentionvote.workflows.sweep.settings import SweepSettings
+from attentionvote.workflows.sweep.settings import TRIAL, SweepSettings
 from attentionvote.workflows.sweep.space import parse_space
 from attentionvote.workflows.sweep.study import Ledger, make_pruner, open_study, study_name
-from attentionvote.workflows.sweep.trial_place import for_trial, log_of, on_worker
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
-TRIAL_JOB = Path(__file__).with_name("trial_elsewhere.py")
+TRAIN = SCRIPTS / "train.py"
 log = logging.getLogger("attentionvote.sweep")
 
 
@@ -48,18 +50,18 @@ class SweepJob:
         training = compose(TrainSettings, self.base)
         self.training = training
         self.part: str = training.object.name
-        found = find_training(training)
+        train_folder = find_training(training).directory
         t = training.trainer
         if t.max_epochs < t.validate_every:
             raise ConfigurationError(
                 f"trainer.max_epochs must be at least trainer.validate_every ({t.validate_every}), or no trial has a "
                 f"val/ap; got {t.max_epochs}"
             )
-        how = cfg.composed["sweep"]
-        self.space = parse_space(how["space"], training)
+        search = cfg.composed["sweep"]
+        self.space = parse_space(search["space"], training)
         experiment_text(self.base, {}, "")  # what cannot be written as an experiment is said now
-        self.pruner = {**how["pruner"], "validate_every": t.validate_every, "max_epochs": t.max_epochs}
-        self.name = study_name(self.part, space, {"training": found.directory.name, "sweep": how})
+        self.pruner = {**search["pruner"], "validate_every": t.validate_every, "max_epochs": t.max_epochs}
+        self.name = study_name(self.part, space, {"training": train_folder.name, "sweep": search})
         self.folder = Path(cfg.sweeps) / self.part / self.name
         self.url = cfg.storage or f"sqlite:///{(self.folder / 'study.db').absolute()}"
         self.workers = cfg.workers or 1
@@ -75,8 +77,8 @@ class SweepJob:
 
     def _on_this_machine(self) -> bool:
         """Whether all trials are known to run here."""
-        own = {"ray": self.cluster["address"] is None, "slurm": self.cluster["slurm"]["system"] == "local"}
-        return own.get(self.cfg.executor, True)
+        local = {"ray": self.cluster["address"] is None, "slurm": self.cluster["slurm"]["system"] == "local"}
+        return local.get(self.cfg.executor, True)
 
     def open(self) -> None:
         """Open the study.
@@ -84,10 +86,10 @@ class SweepJob:
         Raises:
             ValueError: when its database cannot be used, or another sweep is at it.
         """
-        study = open_study(self.url, self.name, self.cfg.heartbeat_s, make_pruner(**self.pruner))
+        stored = open_study(self.url, self.name, make_pruner(**self.pruner))
         sampler = self.cfg.sweep.sampler
-        self.ledger = Ledger(study, self.space, sampler.seed, sampler.random_trials, self.folder)
-        self.ledger.lost()
+        self.ledger = Ledger(stored, self.space, sampler.seed, sampler.random_trials, self.folder, self.cfg.heartbeat_s)
+        self.ledger.check()
 
     def run(self) -> dict[str, Any]:
         """Run what is missing and report; the JSON line.
@@ -113,51 +115,45 @@ class SweepJob:
             self.parent = parent
             with SweepProgress(max(total, done + lost), done, self.workers, self.space) as progress:
                 self.progress = progress
-                driver = SweepDriver(
-                    ledger, self.words, self.directory, self._environment, self.workers, self.cfg.retries,
-                    self.cfg.heartbeat_s, self._logs, self._ended,
-                    TRAIN if self.cfg.executor == "local" else TRIAL_JOB,
-                )  # fmt: skip
                 try:
-                    with self._one_cluster() if done < total or lost else nullcontext():
-                        driver.run(total, progress.tick)
+                    if done < total or lost:
+                        with self._jobs() as jobs:
+                            SweepDriver(
+                                ledger, jobs, self.words, self.directory, self._environment, self.workers,
+                                self.cfg.retries, self.folder / "logs", self._ended,
+                            ).run(total, progress.tick)  # fmt: skip
                 finally:
                     write_table(ledger, self.folder)
             return report(ledger, parent, self.part, self.base, self.folder, self.cfg.save_as)
 
     def words(self, values: Mapping[str, Any]) -> list[str]:
         """The words of a trial's training."""
-        said = any(w.startswith("trainer.threads=") for w in self.base)
-        threads = [] if said else [f"trainer.threads={self.threads}"]
-        how = ["force=false", "resume=auto", f"workers={self.threads}", *threads, f"tracking.parent={self.parent.id}"]
-        return [*self._chosen(values), *how]
+        shared = ["force=false", "resume=auto", f"workers={self.threads}", f"tracking.parent={self.parent.id}"]
+        if not any(word.startswith("trainer.threads=") for word in self.base):
+            shared.append(f"trainer.threads={self.threads}")
+        return [*self._varied(values), *shared]
 
     def directory(self, values: Mapping[str, Any]) -> Path:
         """The folder of a trial's training."""
-        return find_training(compose(TrainSettings, self._chosen(values))).directory
+        return find_training(compose(TrainSettings, self._varied(values))).directory
 
-    def _chosen(self, values: Mapping[str, Any]) -> list[str]:
+    def _varied(self, values: Mapping[str, Any]) -> list[str]:
         return [*self.base, *(setting.word(values[setting.name]) for setting in self.space)]
 
-    @property
-    def _logs(self) -> Path:
-        return self.folder / "logs"
-
     @contextmanager
-    def _one_cluster(self) -> Iterator[None]:
-        """With Ray one cluster for all trials, also where the first to need one would start it for itself."""
-        with ExitStack() as stack:
-            if isinstance(self.executor, RayCluster):
-                kept = stack.enter_context(self.executor.kept(self.workers * self.threads))
-                self.cluster["address"] = kept.address
-            yield
+    def _jobs(self) -> Iterator[JobExecutor]:
+        """What starts trainings; with Ray in one cluster for all, also where the first would start it for itself."""
+        if isinstance(self.executor, RayCluster):
+            with self.executor.shared(self.workers * self.threads) as shared:
+                yield WorkerJobs(TRAIN, "ray", {**self.cluster, "address": shared.address}, self.threads)
+        elif self.cfg.executor == "local":
+            yield LocalJobs(TRAIN)
+        else:
+            yield WorkerJobs(TRAIN, self.cfg.executor, self.cluster, self.threads)
 
     def _environment(self, number: int, slot: int) -> dict[str, str]:
-        trial = for_trial(self.url, self.name, number, self.cfg.heartbeat_s, self.pruner)
-        if self.cfg.executor == "local":
-            return trial | gpu_of_slot(self.gpus, slot)
-        log_file = log_of(self._logs, number)
-        return trial | on_worker(self.cfg.executor, self.cluster, self.threads, log_file, TRAIN)
+        about = {"url": self.url, "study": self.name, "number": number, "owner": self.ledger.owner}
+        return {TRIAL: json.dumps({**about, "pruner": self.pruner})} | gpu_of_slot(self.gpus, slot)
 
     def _ended(self, trial: FrozenTrial) -> None:
         from attentionvote.tracking.group_run import adopt

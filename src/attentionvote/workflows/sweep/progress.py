@@ -1,4 +1,4 @@
-"""What a person sees of a sweep: one bar over all trials with the time left and the best so far, a line a trial."""
+"""The progress of a sweep: one bar over all trials with the time left and the best so far, a line a trial."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ class SweepProgress:
         if best is not None:
             self.best = f"best {best.value:.4f} (trial {best.number})"
         row = trial_row(trial, self.space)
-        said = {
+        ending = {
             TrialState.COMPLETE: lambda: f"val/ap {trial.value:.4f}",
             TrialState.PRUNED: lambda: f"pruned at {row['last_val_ap'] or 0:.4f} after {row['epochs']} epochs",
         }.get(trial.state, lambda: f"failed: {row['reason']}")()
         values = " ".join(f"{s.name}={_short(row.get(s.name))}" for s in self.space)
-        ending = "; ".join(part for part in (self.best, self.left()) if part)
-        line = f"trial {trial.number} ({self.done} of {self.total}): {said}; {values}; {ending}"
+        estimate = "; ".join(part for part in (self.best, self.left()) if part)
+        line = f"trial {trial.number} ({self.done} of {self.total}): {ending}; {values}; {estimate}"
         if self._bar is not None:
             self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
         else:

@@ -1,4 +1,4 @@
-"""What a sweep leaves: a table of its trials, what matters most, and the best settings as an experiment."""
+"""The results of a sweep: a table of its trials, what matters most, and the best settings as an experiment."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def trial_row(trial: FrozenTrial, space: Sequence[Setting]) -> dict[str, Any]:
 
 def run_of(trial: FrozenTrial) -> str | None:
     """Id of the trial's MLflow run, None while it has none."""
-    place = Path(trial.user_attrs.get("directory", "")) / RUN
-    run_id = (read_json(place) or {}).get("run_id") if place.is_file() else None
+    run_file = Path(trial.user_attrs.get("directory", "")) / RUN
+    run_id = (read_json(run_file) or {}).get("run_id") if run_file.is_file() else None
     return run_id if isinstance(run_id, str) else None
 
 
@@ -75,10 +75,10 @@ def importances(ledger: Ledger) -> dict[str, float]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = get_param_importances(ledger.study)
+            shares = get_param_importances(ledger.study)
     except (ValueError, RuntimeError, OptunaError):  # all trials equally good, say
         return {}
-    return {name: float(share) for name, share in found.items()}
+    return {name: float(share) for name, share in shares.items()}
 
 
 def experiment_text(words: Sequence[str], values: Mapping[str, Any], title: str) -> str:
@@ -144,8 +144,8 @@ def check_save_as(name: str | None, experiments: Path = CONF / "experiment", wor
         raise ConfigurationError(
             f"save_as must not replace a file that no sweep wrote, got {name!r}: choose another name"
         )
-    chosen = [o.value() for o in parse(words) if o.key_or_group == "experiment" and not o.is_delete()][-1:]
-    if name in _built_on(chosen, experiments):
+    experiment = [o.value() for o in parse(words) if o.key_or_group == "experiment" and not o.is_delete()][-1:]
+    if name in _built_on(experiment, experiments):
         raise ConfigurationError(
             f"save_as must not name an experiment that the sweep builds on, or its file would build on itself, got "
             f"{name!r}: choose another name"
@@ -154,14 +154,14 @@ def check_save_as(name: str | None, experiments: Path = CONF / "experiment", wor
 
 def _built_on(names: Sequence[Any], experiments: Path) -> set[str]:
     """The experiments of these names and all that stand in their defaults."""
-    found: set[str] = set()
+    reached: set[str] = set()
     rest = [str(name) for name in names if name is not None]
     while rest:
         name = rest.pop()
         path = experiments / f"{name}.yaml"
-        if name in found or not path.is_file():
+        if name in reached or not path.is_file():
             continue
-        found.add(name)
+        reached.add(name)
         defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
         rest += [entry for entry in defaults if isinstance(entry, str)]
-    return found
+    return reached

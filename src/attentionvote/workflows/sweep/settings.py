@@ -10,6 +10,11 @@ from attentionvote.setting import Setting
 from attentionvote.workflows.fleet.settings import RETRIES, THREADS
 from attentionvote.workflows.train.settings import TrainSettings
 
+# What a sweep and the processes of its trials agree on.
+TRIAL = "ATTENTIONVOTE_TRIAL"  # variable of the environment: whose trial a training is
+PRUNED_CODE = 3  # exit code of a process whose trial was pruned
+PRUNED_AT = "pruned_at_epoch"  # attribute of the trial: the decision stands, whatever happens to its process
+
 
 @dataclass(frozen=True)
 class Sampler:

@@ -78,10 +78,10 @@ def parse_space(entries: Sequence[Mapping[str, Any]], base: TrainSettings) -> li
     Raises:
         ConfigurationError: with one sentence, when an entry is unknown, impossible or out of range.
     """
-    known = dict(leaves(base.composed))
+    defaults = dict(leaves(base.composed))
     if not entries:
         raise ConfigurationError("sweep.space must have at least one setting, got none")
-    settings = [_setting(entry, known) for entry in entries]
+    settings = [_setting(entry, defaults) for entry in entries]
     names = [setting.name for setting in settings]
     for name in names:
         if names.count(name) > 1:
@@ -94,13 +94,13 @@ def parse_space(entries: Sequence[Mapping[str, Any]], base: TrainSettings) -> li
     return settings
 
 
-def _setting(entry: Any, known: Mapping[str, Any]) -> Setting:
+def _setting(entry: Any, defaults: Mapping[str, Any]) -> Setting:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
         raise ConfigurationError(f"every entry of sweep.space must be a section with a name and a kind, got {entry!r}")
     name, kind = entry["name"], entry.get("kind")
     where = f"sweep.space, {name}"
-    if name not in known:
-        raise ConfigurationError(f"sweep.space must name settings of a training, got {name!r}{nearest(name, known)}")
+    if name not in defaults:
+        raise ConfigurationError(f"sweep.space must name settings of a training, got {name!r}{nearest(name, defaults)}")
     if name in NOT_IDENTITY or name.startswith(("tracking.", "object.")):
         what = "the part" if name.startswith("object.") else "how a training is run"
         raise ConfigurationError(f"sweep.space must name settings of what is learned, but {name!r} is about {what}")
@@ -114,12 +114,12 @@ def _setting(entry: Any, known: Mapping[str, Any]) -> Setting:
     values = _choices(entry, where) if kind == "categorical" else _bounds(entry, where, kind)
     for value in values:
         try:
-            check_types(TrainSettings, name, known[name], value)
+            check_types(TrainSettings, name, defaults[name], value)
             check_value(TrainSettings, name, value)
         except (ConfigurationError, SettingError) as error:
             raise ConfigurationError(f"sweep.space: {error}") from None
-    if kind == "float" and isinstance(known[name], int):
-        raise ConfigurationError(f"{where}: kind must be int, because {known[name]} is a whole number; got 'float'")
+    if kind == "float" and isinstance(defaults[name], int):
+        raise ConfigurationError(f"{where}: kind must be int, because {defaults[name]} is a whole number; got 'float'")
     if kind == "categorical":
         return Setting(name, kind, choices=tuple(values))
     return Setting(name, kind, values[0], values[1], bool(entry.get("log", False)))

@@ -12,10 +12,13 @@ import json
 import platform
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC
 from pathlib import Path
 from typing import Any
 
 import optuna
+import sqlalchemy
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import TPESampler
 from optuna.storages import RDBStorage
@@ -23,17 +26,50 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from attentionvote.workflows.sweep.space import Setting
 
-# Attributes of a trial: where the sweep runs that is at it, how often its process died.
-OWNER, CRASHES = "owner", "crashes"
+CRASHES = "crashes"  # attribute of a trial: how often its process died
+_LEASE = "sweep"  # attribute of a study: where the sweep is that works at it, and when it gave its last sign of life
+_SILENT = 3  # heartbeats without a sign of life after which a sweep counts as dead
 
 
-def open_study(url: str, name: str, heartbeat_s: int, pruner: BasePruner | None = None) -> optuna.Study:
+@dataclass(frozen=True)
+class StoredStudy:
+    """A study and the database that it lies in."""
+
+    study: optuna.Study
+    storage: RDBStorage
+
+    def trial(self, number: int) -> Trial:
+        """A trial that was begun, to report to or to go on with."""
+        study_id = self.storage.get_study_id_from_name(self.study.study_name)
+        return Trial(self.study, self.storage.get_trial_id_from_study_id_trial_number(study_id, number))
+
+    def owner(self) -> str | None:
+        """Where the sweep is that has the study; None before the first."""
+        owner: str | None = self.study.user_attrs.get(_LEASE, {}).get("owner")
+        return owner
+
+    def silence_s(self) -> float:
+        """How long its owner has given no sign of life."""
+        return self._now_s() - float(self.study.user_attrs[_LEASE]["seen_s"])
+
+    def lease(self, owner: str) -> None:
+        """Give a sign of life."""
+        self.study.set_user_attr(_LEASE, {"owner": owner, "seen_s": self._now_s()})
+
+    def _now_s(self) -> float:
+        # The database's clock: those of the machines need not agree.
+        with self.storage.engine.connect() as connection:
+            now = connection.execute(sqlalchemy.select(sqlalchemy.func.current_timestamp())).scalar_one()
+        seconds: float = (now if now.tzinfo else now.replace(tzinfo=UTC)).timestamp()
+        return seconds
+
+
+def open_study(url: str, name: str, pruner: BasePruner | None = None) -> StoredStudy:
     """Open a study, created when new; larger values are better.
 
     Args:
         url: an SQLAlchemy URI.
         name: of the study.
-        heartbeat_s: seconds between signs of life; without any for three of them, a trial counts as lost.
         pruner: asked by trials.
 
     Raises:
@@ -42,18 +78,17 @@ def open_study(url: str, name: str, heartbeat_s: int, pruner: BasePruner | None 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sqlite = url.startswith("sqlite")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the heartbeat is called experimental; SQLAlchemy deprecates its own
+        warnings.simplefilter("ignore")  # SQLAlchemy deprecates its own
         try:
             storage = RDBStorage(
                 url,
                 # Several processes write to one file: each waits for the others.
                 engine_kwargs={"connect_args": {"timeout": 60}} if sqlite else {"pool_pre_ping": True},
-                heartbeat_interval=heartbeat_s,
-                grace_period=3 * heartbeat_s,
             )
-            return optuna.create_study(
+            study = optuna.create_study(
                 storage=storage, study_name=name, direction="maximize", pruner=pruner, load_if_exists=True
             )
+            return StoredStudy(study, storage)
         except Exception as error:  # SQLAlchemy's, the driver's, Optuna's
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise ValueError(
@@ -64,12 +99,9 @@ def open_study(url: str, name: str, heartbeat_s: int, pruner: BasePruner | None 
 
 def without_password(url: str) -> str:
     """A database URI that may be shown."""
-    from sqlalchemy.engine import make_url
-    from sqlalchemy.exc import ArgumentError
-
     try:
-        return make_url(url).render_as_string(hide_password=True)
-    except ArgumentError:
+        return sqlalchemy.make_url(url).render_as_string(hide_password=True)
+    except sqlalchemy.exc.ArgumentError:
         return url.rpartition("@")[2]
 
 
@@ -88,18 +120,27 @@ class Ledger:
     """What has been done in a study, and what is to be done; a process that holds the study's folder writes it.
 
     Args:
-        study: see :func:`open_study`.
+        stored: see :func:`open_study`.
         space: the settings that are searched.
         seed: of all draws.
         random_trials: trials drawn at random before the sampler learns.
         folder: of the study on this machine; whoever holds its lock owns the trials that were started from it.
+        heartbeat_s: seconds between signs of life.
     """
 
     def __init__(
-        self, study: optuna.Study, space: Sequence[Setting], seed: int, random_trials: int, folder: Path
+        self,
+        stored: StoredStudy,
+        space: Sequence[Setting],
+        seed: int,
+        random_trials: int,
+        folder: Path,
+        heartbeat_s: int,
     ) -> None:
-        self.study, self.space, self.seed, self.random_trials = study, list(space), seed, random_trials
+        self.stored, self.study, self.space = stored, stored.study, list(space)
+        self.seed, self.random_trials, self.heartbeat_s = seed, random_trials, heartbeat_s
         self.owner = f"{platform.node()}:{folder.absolute()}"
+        self._leased = False
 
     @property
     def trials(self) -> list[FrozenTrial]:
@@ -120,48 +161,67 @@ class Ledger:
         """The trials that were begun and that nobody is at any more.
 
         Raises:
-            ValueError: when a sweep in another place is at this study.
+            ValueError: see :meth:`check`.
         """
-        begun = [trial for trial in self.trials if trial.state == TrialState.RUNNING]
-        storage: Any = self.study._storage
-        silent = set(storage._get_stale_trial_ids(self.study._study_id))
-        for trial in begun:
-            other = trial.user_attrs.get(OWNER, self.owner)
-            # Ours are lost for certain: we hold the folder's lock. Others' are when they give no sign of life.
-            if other != self.owner and trial._trial_id not in silent:
-                raise ValueError(
-                    f"the study {self.study.study_name} must have one sweep at a time, but the one at {other} gave a "
-                    f"sign of life less than {3 * storage.get_heartbeat_interval()} s ago: wait for it, or end it"
-                )
-        return begun
+        self.check()
+        return [trial for trial in self.trials if trial.state == TrialState.RUNNING]
+
+    def check(self) -> None:
+        """Refuse to work at a study that another sweep has; before whatever is written.
+
+        Raises:
+            ValueError: when a sweep in another place is at this study, or has taken it over from us.
+        """
+        owner = self.stored.owner()
+        # What we have not leased is ours all the same when the lease is our folder's: we hold its lock.
+        if owner is None or owner == self.owner:
+            return
+        if self._leased:  # we were stopped for so long that we counted as dead
+            raise ValueError(
+                f"the sweep stops, because it gave no sign of life for {_SILENT * self.heartbeat_s} s and the one at "
+                f"{owner} took the study {self.study.study_name} over: leave it to that one, or end that one and start "
+                "the same command here again"
+            )
+        least_s = _SILENT * self.heartbeat_s
+        if self.count(TrialState.RUNNING) and self.stored.silence_s() < least_s:
+            raise ValueError(
+                f"the study {self.study.study_name} must have one sweep at a time, but the one at {owner} gave a "
+                f"sign of life less than {least_s} s ago: wait for it, or end it"
+            )
+
+    def beat(self) -> None:
+        """Give a sign of life.
+
+        Raises:
+            ValueError: see :meth:`check`.
+        """
+        self.check()
+        self.stored.lease(self.owner)
+        self._leased = True
 
     def begin(self, lost: FrozenTrial | None = None) -> tuple[Trial, dict[str, Any]]:
         """Begin a new trial, or a lost one again; the trial and its values by setting."""
+        self.beat()
         number = len(self.trials) if lost is None else lost.number
         self.study.sampler = self._sampler(number)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # signs of life are called experimental, and given by us
-            trial = self.study.ask() if lost is None else Trial(self.study, lost._trial_id)
-            trial.set_user_attr(OWNER, self.owner)
-            self.beat([trial])
-            return trial, {setting.name: setting.suggest(trial) for setting in self.space}
+        trial = self.study.ask() if lost is None else self.stored.trial(number)
+        return trial, {setting.name: setting.suggest(trial) for setting in self.space}
 
-    def beat(self, trials: Sequence[Trial]) -> None:
-        """Give a sign of life for trials."""
-        storage: Any = self.study._storage
-        for trial in trials:
-            storage.record_heartbeat(trial._trial_id)
+    def note(self, trial: Trial, **about: Any) -> None:
+        """Write what there is to say about a trial."""
+        self.check()
+        for name, text in about.items():
+            trial.set_user_attr(name, text)
 
     def crashed(self, trial: Trial) -> int:
         """Note that the process of a trial died; how often by now."""
         times = int(trial.user_attrs.get(CRASHES, 0)) + 1
-        trial.set_user_attr(CRASHES, times)
+        self.note(trial, **{CRASHES: times})
         return times
 
     def end(self, trial: Trial, state: TrialState, value: float | None = None, **about: Any) -> None:
         """Write how a trial ended, and what there is to say about it."""
-        for name, text in about.items():
-            trial.set_user_attr(name, text)
+        self.note(trial, **about)
         self.study.tell(trial.number, value, state)
 
     def _sampler(self, number: int) -> TPESampler:

@@ -1,4 +1,8 @@
-"""In the process of a trial: what its training reports to the study, and the end of a trial that is not worth it."""
+"""In the process of a trial: what its training reports to the study, and the end of a trial that is not worth it.
+
+A trial is an ordinary training. The sweep that starts it says so in one variable of the environment, because
+whose trial it is does not belong to the settings of the training.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +14,22 @@ from typing import TYPE_CHECKING
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 
-from attentionvote.workflows.sweep.trial_place import PRUNED_AT, PRUNED_CODE, VARIABLE
+from attentionvote.workflows.sweep.settings import PRUNED_AT, PRUNED_CODE, TRIAL
 
 if TYPE_CHECKING:
-    from optuna.trial import Trial
+    from attentionvote.workflows.sweep.study import StoredStudy
 
 
 def trial_callbacks() -> list[Callback]:
     """What a training needs as a trial of a sweep; nothing elsewhere."""
-    said = os.environ.get(VARIABLE)
-    if said is None:
+    trial = os.environ.get(TRIAL)
+    if trial is None:
         return []
-    from optuna.trial import Trial
-
     from attentionvote.workflows.sweep.study import make_pruner, open_study
 
-    about = json.loads(said)
-    study = open_study(about["url"], about["study"], about["heartbeat_s"], make_pruner(**about["pruner"]))
-    return [TrialReport(Trial(study, study.trials[about["number"]]._trial_id))]
+    about = json.loads(trial)
+    stored = open_study(about["url"], about["study"], make_pruner(**about["pruner"]))
+    return [TrialReport(stored, about["number"], about["owner"])]
 
 
 class TrialReport(Callback):
@@ -37,15 +39,22 @@ class TrialReport(Callback):
     may be trained to the end later. The last validation prunes nothing: the trial is complete.
     """
 
-    def __init__(self, trial: Trial) -> None:
-        self.trial = trial
+    def __init__(self, stored: StoredStudy, number: int, owner: str) -> None:
+        self.stored, self.number, self.owner = stored, number, owner
+        self.trial = stored.trial(number)
         self.pruned = False
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Report the score."""
+        """Report the score.
+
+        Raises:
+            ValueError: when another sweep has taken the study over: the trial is its, and trained by its training.
+        """
         del pl_module
         if trainer.sanity_checking or "val/ap" not in trainer.callback_metrics:
             return
+        if (owner := self.stored.owner()) not in (None, self.owner):
+            raise ValueError(f"the training ends, because the sweep at {owner} took its trial {self.number} over")
         epoch = trainer.current_epoch + 1
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an epoch repeated after a kill -9 gives the value that is there

@@ -41,7 +41,7 @@ def test_a_served_model_was_verified_and_tested(bundle_folder: Path, trusted_key
     loader = BundleLoader(trusted_key, lambda bundle, _: Workers(bundle, WorkerSettings()), None)
     served, failure = loader.from_source(bundle_folder, must_keep=True)
     assert failure is None
-    assert not served.kept  # there is no store
+    assert not served.saved  # there is no store
     served.workers.close()
     assert (served.name, served.version) == ("bracket", served.digest[:12])
     assert loader.last_known_good() == (None, [])

@@ -43,7 +43,7 @@ def test_the_old_one_is_closed_after_its_last_request(
     other = make_bundle("new", graph={"heat": (9.0, 6.0, 3.0, 1.0)})
     new = Workers(load_bundle(other, trusted_key), WorkerSettings())
     body, go_on = npy(make_cloud()), threading.Event()
-    serving.swap(Served(old, kept=True, last_known_good=False))
+    serving.swap(Served(old, saved=True, last_known_good=False))
 
     def slow() -> Any:
         assert go_on.wait(20)
@@ -52,7 +52,7 @@ def test_the_old_one_is_closed_after_its_last_request(
     for _ in range(2):
         old.hold()
     running, waiting = serving.submit(slow), serving.submit(slow)
-    serving.swap(Served(new, kept=True, last_known_good=False))
+    serving.swap(Served(new, saved=True, last_known_good=False))
     assert serving.model().workers is new
     go_on.set()
     assert len(running.result(20)["poses"]) == 2
@@ -71,8 +71,8 @@ def test_what_only_changes_its_facts_is_not_closed(
     serving: Serving, bundle_folder: Path, trusted_key: Path, make_cloud: Callable[..., Any], npy: Any
 ) -> None:
     workers = Workers(load_bundle(bundle_folder, trusted_key), WorkerSettings())
-    serving.swap(Served(workers, kept=False, last_known_good=False))
-    serving.swap(Served(workers, kept=True, last_known_good=False))
+    serving.swap(Served(workers, saved=False, last_known_good=False))
+    serving.swap(Served(workers, saved=True, last_known_good=False))
     serving.submit(int).result(20)
     assert len(estimate(workers, npy(make_cloud()))["poses"]) == 2
 
@@ -83,7 +83,7 @@ def test_a_model_is_the_one_asked_for_or_refused(serving: Serving, bundle_folder
         serving.model()
     assert (caught.value.status, caught.value.headers) == (503, {"Retry-After": "2"})
     served = Served(
-        Workers(load_bundle(bundle_folder, trusted_key), WorkerSettings()), kept=True, last_known_good=False
+        Workers(load_bundle(bundle_folder, trusted_key), WorkerSettings()), saved=True, last_known_good=False
     )
     serving.swap(served)
     for name, version in ((None, None), ("bracket", None), ("bracket", served.version), (None, served.version)):

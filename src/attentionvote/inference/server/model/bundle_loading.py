@@ -103,8 +103,8 @@ class BundleLoader:
         except BaseException:  # the folder is no longer what was loaded
             workers.close()
             raise
-        kept = self.store is not None and failure is None
-        return Served(workers, kept, last_known_good=False, origin=self._origin(bundle)), failure
+        saved = self.store is not None and failure is None
+        return Served(workers, saved, last_known_good=False, origin=self._origin(bundle)), failure
 
     def keep(self, source: Path, digest: str) -> bool:
         """Keep a bundle that serves already; False when the path holds another by now.
@@ -128,7 +128,7 @@ class BundleLoader:
             except (BundleError, OSError) as error:
                 problems.append(str(error))
             else:
-                return Served(workers, kept=True, last_known_good=True, origin=self._origin(bundle)), problems
+                return Served(workers, saved=True, last_known_good=True, origin=self._origin(bundle)), problems
         return None, problems
 
     def _origin(self, bundle: Bundle) -> RegistryVersion | None:

@@ -28,7 +28,7 @@ from attentionvote.inference.server.priority import be_polite
 
 _LONGEST_AWAY_S, _LONGEST_RETRY_S = 60.0, 300.0
 _SLOW_S = 60.0  # a step that lasts longer is said to: each of a bundle's files may take half a minute and more
-_MOST_TOLD = 100
+_MOST_REPORTED = 100
 # Cells that were switched on together, or lost their registry together, must not ask in one voice.
 _JITTER = 0.2
 
@@ -59,8 +59,8 @@ class Following:
         self._registry, self._bundles, self._watch = registry, bundles, watch
         self._serving, self._metrics = serving, metrics
         self._poll_s, self._patience_s = poll_s, patience_s
-        self._own_problem: str | None = None
-        self._told: set[str] = set()
+        self._registry_problem: str | None = None
+        self._reported: set[str] = set()
         self._away_s = poll_s
         self._refused: RegistryVersion | None = None
         self._refusal: Exception | None = None
@@ -68,12 +68,12 @@ class Following:
         self._watching = False
         self._lock = asyncio.Lock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="registry", initializer=be_polite)
-        watch.explain = lambda: self._own_problem
+        watch.explain = lambda: self._registry_problem
 
     @property
     def problem(self) -> str | None:
         """Why what the registry names does not serve; None: it does, as far as is known."""
-        return self._own_problem or self._watch.problem
+        return self._registry_problem or self._watch.problem
 
     async def run(self) -> None:
         """Follow until cancelled."""
@@ -154,12 +154,12 @@ class Following:
         """Say why the registry's model does not serve, once for each reason."""
         self._metrics.registry_problem(sentence)
         serves = self._serving.current
-        if sentence not in self._told:
+        if sentence not in self._reported:
             stays = f"{serves.name} {serves.version} goes on serving" if serves else "nothing serves yet"
             say("registry", f"{sentence}; {stays}", logging.ERROR, trace=trace)
-        if len(self._told) < _MOST_TOLD:
-            self._told.add(sentence)
-        self._own_problem = sentence
+        if len(self._reported) < _MOST_REPORTED:
+            self._reported.add(sentence)
+        self._registry_problem = sentence
         if serves is None:
             self._serving.waits_for = sentence
 
@@ -167,10 +167,10 @@ class Following:
         """The link leads to what the registry names."""
         self._metrics.registry_polls.labels("answered").inc()
         self._metrics.registry_problem(None)
-        if self._own_problem is not None:
+        if self._registry_problem is not None:
             say("registry", f"{self._bundles.reference} can be followed, the problem is over")
-        self._own_problem, self._away_s = None, self._poll_s
-        self._told.clear()
+        self._registry_problem, self._away_s = None, self._poll_s
+        self._reported.clear()
 
     def _served_digests(self) -> frozenset[str]:
         current = self._serving.current

@@ -26,7 +26,7 @@ from attentionvote.inference.fetching.reference import SCHEME, Reference
 from attentionvote.inference.home_folder import home_folder
 
 STATE_VARIABLE = "ATTENTIONVOTE_STATE"
-KEPT = 2
+COPIES = 2
 _NAME = re.compile(r"(\d{8})-([0-9a-f]{12})")
 
 
@@ -64,8 +64,8 @@ class LastKnownGood:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._kept = folder / "kept"
-        self._kept.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._copies = folder / "kept"
+        self._copies.mkdir(parents=True, exist_ok=True, mode=0o700)
         self._lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -86,7 +86,7 @@ class LastKnownGood:
     def entries(self) -> list[Path]:
         """The copies, newest first."""
         with suppress(OSError):
-            return sorted((p for p in self._kept.iterdir() if _NAME.fullmatch(p.name)), reverse=True)
+            return sorted((p for p in self._copies.iterdir() if _NAME.fullmatch(p.name)), reverse=True)
         return []
 
     def newest_digest(self) -> str | None:
@@ -106,10 +106,10 @@ class LastKnownGood:
             OSError: when it cannot be written (a full disk, say); the copies before are untouched.
             BundleError: when the folder is no longer what was loaded.
         """
-        self._kept.mkdir(parents=True, exist_ok=True, mode=0o700)  # somebody may have removed it meanwhile
+        self._copies.mkdir(parents=True, exist_ok=True, mode=0o700)  # somebody may have removed it meanwhile
         entries = self.entries()
         number = 1 + (int(entries[0].name.partition("-")[0]) if entries else 0)
-        target = self._kept / f"{number:08d}-{bundle.digest[:12]}"
+        target = self._copies / f"{number:08d}-{bundle.digest[:12]}"
         same = next((p for p in entries if p.name.endswith(target.name[9:]) and _intact(p, bundle, trusted)), None)
         if same is not None and same == entries[0]:
             return
@@ -121,10 +121,10 @@ class LastKnownGood:
                 if load_bundle(staging, trusted).digest != bundle.digest:
                     raise OSError(f"{source} was exchanged while it was copied")
                 os.rename(staging, target)
-        sync(self._kept)
+        sync(self._copies)
         damaged = {p for p in entries if p.name.endswith(target.name[9:])} - {target}
         others = [p for p in self.entries() if p not in damaged]
-        for old in [*damaged, *others[KEPT:]]:
+        for old in [*damaged, *others[COPIES:]]:
             with suppress(OSError), self._staging() as staging:
                 os.rename(old, staging / old.name)  # so that half a copy never stands among the whole ones
 

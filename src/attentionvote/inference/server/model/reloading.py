@@ -69,7 +69,7 @@ class BundleWatch:
         self.explain: Callable[[], str | None] = lambda: None
         self._source, self._loader, self._serving, self._metrics = source, loader, serving, metrics
         self._poll_s, self._patience_s = poll_s, patience_s
-        self._not_kept_because: str | None = None
+        self._save_failure: str | None = None
         self._tried: Mark | None = None
         self._retry_s, self._retry_at = _FIRST_RETRY_S, 0.0
         self._lock = asyncio.Lock()
@@ -118,7 +118,7 @@ class BundleWatch:
         if current is not None and not current.last_known_good and mark.digest == current.digest:
             self._tried = None
             self._serves()
-            if current.kept or store is None:
+            if current.saved or store is None:
                 self._fine()
             elif due:
                 await self._keep(current)
@@ -133,24 +133,24 @@ class BundleWatch:
         self._serving.swap(served)
         self._fine()
         if failure is not None:
-            self._not_kept(failure)
+            self._save_failed(failure)
 
     async def _keep(self, current: Served) -> None:
         """Try again to keep what serves already."""
         try:
             done = await self._blocking(self._loader.keep, self._source, current.digest)
         except (OSError, BundleError) as error:
-            self._not_kept(error)
+            self._save_failed(error)
         else:
             if done:
-                self._serving.swap(dataclasses.replace(current, kept=True))
+                self._serving.swap(dataclasses.replace(current, saved=True))
                 self._fine()
 
-    def _not_kept(self, error: Exception) -> None:
+    def _save_failed(self, error: Exception) -> None:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         self._later()
-        if str(reason) != self._not_kept_because:
-            self._not_kept_because = str(reason)
+        if str(reason) != self._save_failure:
+            self._save_failure = str(reason)
             sentence = f"the bundle serves but cannot be kept for the next start: {reason}; it is tried again"
             say("last_known_good", sentence, logging.ERROR)
 
@@ -186,7 +186,7 @@ class BundleWatch:
     def _fine(self) -> None:
         """The bundle at the path serves, and nothing is left to be tried again."""
         self._retry_s = _FIRST_RETRY_S
-        self._not_kept_because = None
+        self._save_failure = None
         self._serves()
 
     def _serves(self) -> None:

@@ -25,13 +25,13 @@ class Served:
 
     Attributes:
         workers: with the verified bundle.
-        kept: whether a copy for the next start is on the disk.
+        saved: whether a copy for the next start is on the disk.
         last_known_good: whether it came from such a copy, not from the given path.
         origin: which registered version it is; None where it came from a path.
     """
 
     workers: Workers
-    kept: bool
+    saved: bool
     last_known_good: bool
     origin: RegistryVersion | None = None
 
@@ -115,15 +115,15 @@ class Serving:
         """Let another model serve. Requests that were queued before end on the old one, which is closed after them."""
         old, self.current = self.current, served
         self._metrics.serving(
-            served.name, served.version, served.digest, kept=served.kept, last_known_good=served.last_known_good
+            served.name, served.version, served.digest, saved=served.saved, last_known_good=served.last_known_good
         )
         self._metrics.registered(served.origin)
         say(
             "model", f"{served.name} {served.version} serves",
             part=served.name, version=served.version, digest=served.digest,
-            kept=served.kept, last_known_good=served.last_known_good, before=old.version if old else None,
+            kept=served.saved, last_known_good=served.last_known_good, before=old.version if old else None,
             registry=str(served.origin) if served.origin else None,
-            level=logging.WARNING if served.last_known_good or not served.kept else logging.INFO,
+            level=logging.WARNING if served.last_known_good or not served.saved else logging.INFO,
         )  # fmt: skip
         if old is not None and old.workers is not served.workers:
             old.workers.retire()

@@ -1,4 +1,4 @@
-"""Where a server's model comes from: a path, or a model in a registry that is fetched into the state folder."""
+"""The source of a server's model: a path, or a model in a registry that is fetched into the state folder."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Source:
     @property
     def warnings(self) -> list[str]:
         """What an operator should know about the credentials."""
-        found = []
+        warnings = []
         if self.access is not None and self.access.readable_by_others:
-            found.append("the registry's credentials can be read by everybody on this machine: chmod 600 their file")
+            warnings.append("the registry's credentials can be read by everybody on this machine: chmod 600 their file")
         if self.access is not None and self.access.open_to_listeners and not is_loopback(self.access.host):
-            found.append("the registry's password crosses the network unencrypted: give --registry an https address")
-        return found
+            warnings.append("the registry's password crosses the network unencrypted: give --registry an https address")
+        return warnings
 
     def bundles(self, state: Path, key: Ed25519PublicKey) -> FetchedBundles | None:
         """The fetched bundles below the state folder, their link on the newest one of this reference; None for a path.

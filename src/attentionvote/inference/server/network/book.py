@@ -80,7 +80,7 @@ class ConnectionBook:
             Whether there is a place for it.
         """
         if len(self.entries) >= self.most:
-            self.free_one()
+            self.make_room()
         if len(self.entries) >= self.most + HEALTH_CONNECTIONS:
             return False
         entry.spare = len(self.entries) >= self.most
@@ -98,7 +98,7 @@ class ConnectionBook:
         self.entries.discard(entry)
         self._metrics.connections.set(len(self.entries))
 
-    def free_one(self) -> None:
+    def make_room(self) -> None:
         """End the longest silent connection without a request, if there is one."""
         idle = [entry for entry in self.entries if not entry.busy]
         if not idle:

@@ -79,7 +79,7 @@ class CellServer(uvicorn.Server):
                     self._book.say_once(
                         "handles", f"no connection can be taken up ({error.strerror}); it is tried again"
                     )
-                    self._book.free_one()
+                    self._book.make_room()
                     await asyncio.sleep(_TRY_AGAIN_S)
                 continue
             connection = CellConnection(self.config, self.server_state, self.lifespan.state, self._book)

@@ -168,22 +168,22 @@ def _outputs(asked: object, binary: bool) -> tuple[AskedOutput, ...]:
         return tuple(AskedOutput(name, binary) for name in OUTPUTS)
     if not isinstance(asked, list) or len(asked) > len(OUTPUTS):
         raise InputError(f"outputs must be a list of at most {len(OUTPUTS)}, got {_short(asked)}")
-    found: list[AskedOutput] = []
+    outputs: list[AskedOutput] = []
     for entry in asked:
         output = _object("an output", entry)
         name = output.get("name")
         if not isinstance(name, str) or name not in OUTPUTS:
             hint = nearest(name, OUTPUTS) if isinstance(name, str) else ""
             raise InputError(f"an output must be one of {', '.join(OUTPUTS)}, got {_short(name)}{hint}")
-        if name in (other.name for other in found):
+        if name in (other.name for other in outputs):
             raise InputError(f"an output must be asked for once, got {name!r} twice")
         parameters = _object(f"parameters of output {name!r}", output.get("parameters", {}))
         for unsupported in ("shared_memory_region", "classification"):
             if parameters.get(unsupported):
                 raise InputError(f"output {name!r} must be sent as data or binary data, got {unsupported}")
         flag = parameters.get("binary_data", binary)
-        found.append(AskedOutput(name, _flag(f"parameter binary_data of output {name!r}", flag)))
-    return tuple(found)
+        outputs.append(AskedOutput(name, _flag(f"parameter binary_data of output {name!r}", flag)))
+    return tuple(outputs)
 
 
 def _deadline_ms(parameters: Mapping[str, Any]) -> float | None:

@@ -1,4 +1,4 @@
-"""What a worker does with a request's body: reads it, estimates, and writes the answer's body. One job at a time."""
+"""The jobs of a worker: it reads a request's body, estimates, and writes the answer's body. One at a time."""
 
 from __future__ import annotations
 

@@ -67,13 +67,13 @@ class Workers:
     def available(self) -> bool:
         """Whether a request would be worked on: a loaded worker is there that is not beyond a deadline."""
         with self._changed:
-            return not self._closed and any(one.alive and not one.overdue for one in self._both())
+            return not self._closed and any(worker.alive and not worker.overdue for worker in self._both())
 
     @property
     def memory_bytes(self) -> int:
         """Resident memory of both."""
         with self._changed:
-            return sum(one.memory_bytes for one in self._both())
+            return sum(worker.memory_bytes for worker in self._both())
 
     def hold(self) -> None:
         """Somebody will ask: they are not closed before :meth:`release`."""
@@ -142,7 +142,7 @@ class Workers:
             worker.kill()
 
     def _both(self) -> list[WorkerProcess]:
-        return [one for one in (self._active, self._spare) if one is not None]
+        return [worker for worker in (self._active, self._spare) if worker is not None]
 
     def _take(self, deadline: Deadline) -> WorkerProcess | None:
         """The worker for the next job in line; while there is none, it is waited for until the deadline."""
@@ -196,7 +196,7 @@ class Workers:
             stands = self._active is not None
             self._changed.notify_all()
         self._tell(reason)
-        say("worker", f"{detail}; {'its spare' if stands else 'the next one'} goes on", logging.ERROR, reason=reason)
+        say("worker", f"{detail}; {'its spare' if stands else 'the next worker'} goes on", logging.ERROR, reason=reason)
 
     def _keep_a_spare(self) -> None:
         """Look after both until they are closed, whatever happens."""
@@ -217,7 +217,7 @@ class Workers:
                     self._changed.wait(_LOOK_S)
                 if self._closed:
                     return
-                idle = [one for one in self._both() if one.ended_idle]
+                idle = [worker for worker in self._both() if worker.ended_idle]
                 missing, alone = self._spare is None, self._active is None
             for worker in idle:
                 self._drop(worker, "crashed", "a worker ended while it had nothing to do")
