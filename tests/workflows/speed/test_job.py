@@ -17,7 +17,7 @@ from attentionvote.geometry import sampling_reference
 from attentionvote.workflows.speed import rows as bench_rows
 from attentionvote.workflows.speed.settings import SpeedSettings
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SMALL = ["object=brick", "compact=['experiment=smoke']", "full=['experiment=smoke']", "rounds=2"]
 OTHERS = "# Page\n\nby hand\n\n<!-- table_6: written by make benchmark -->\nit\n<!-- end of table_6 -->\n"
 

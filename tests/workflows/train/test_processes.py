@@ -27,7 +27,7 @@ from attentionvote.workflows.train.processes import TrainingProcess, first_speak
 from attentionvote.workflows.train.settings import TrainSettings
 from attentionvote.workflows.train.torchrun import _cause
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 # Three scenes to validate and to test: no equal shares. Every proposal is trained on, in small steps: differences of
 # rounding then stay what they are for a while.
 WORDS = [

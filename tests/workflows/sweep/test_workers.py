@@ -46,7 +46,7 @@ print(json.dumps({"val_ap": x}))
 SWEEP = f"""
 import sys
 sys.path[:0] = [{str(Path(__file__).parent)!r}]
-from test_sweep_workers import sweep
+from test_workers import sweep
 from pathlib import Path
 try: sweep(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
 except KeyboardInterrupt: sys.exit(130)

@@ -51,7 +51,7 @@ print(json.dumps({"val_ap": None if does == "no score" else x, "metrics": {"ap_1
 SWEEP = f"""
 import sys
 sys.path[:0] = [{str(Path(__file__).parent)!r}]
-from test_sweep_driver import driver
+from test_driver import driver
 from pathlib import Path
 try: driver(Path(sys.argv[1]), int(sys.argv[3]), heartbeat_s=1)[1].run(int(sys.argv[2]), lambda: None)
 except KeyboardInterrupt: sys.exit(130)

@@ -15,7 +15,7 @@ from attentionvote.workflows.tables.record import BenchmarkRecord
 from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.tables.table import BenchmarkTable
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
 def test_cells_of_earlier_calls_are_there_and_replaced_one_by_one(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.preset import preset_of_workers
 from attentionvote.workflows.train.settings import TrainSettings
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 TINY = [
     "experiment=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1,2]", "data.density=1500",
     "data.pool=800", "data.points=128", "trainer.batch_size=4", "trainer.max_epochs=2", "trainer.validate_every=2",

@@ -17,7 +17,7 @@ import pytest
 
 from attentionvote.workflows.speed.serving import Expected, Tally, _ask, expectations, server
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 # Writes a tiny signed bundle with the tests' own builder, in a process of its own: fixtures do not cross folders.
 BUILDER = """
 import importlib.util, sys

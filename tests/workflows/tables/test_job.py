@@ -25,7 +25,7 @@ from attentionvote.workflows.tables.settings import TablesSettings
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 # One cycle of two scenes with a few bricks.
 FEW = ["evaluation.cycles=1", "evaluation.density=2000", "evaluate=['simulation=smoke','simulation.drop_counts=[2,3]']"]
 COARSE = ["baseline_workers=1", "ppf.sampling=0.15"]

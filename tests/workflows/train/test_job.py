@@ -32,7 +32,7 @@ from attentionvote.drawing import figures, scene_pictures
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.workflows.train.settings import TrainSettings
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 TINY = [
     "object=brick", *TINY_TRAINING, "simulation.drop_counts=[1,2]", "workers=1", "trainer.max_epochs=6",
     "trainer.validate_every=2", "trainer.average_decay=0.5", "force=false",

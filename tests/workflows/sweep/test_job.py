@@ -28,7 +28,7 @@ from attentionvote.workflows.sweep.settings import SweepSettings
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 EPOCHS = 4
 TINY = [
     "object=brick", "experiment=smoke", "sweep=smoke", "simulation.cycles.train=4", "simulation.drop_counts=[1]",
