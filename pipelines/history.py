@@ -10,6 +10,7 @@ from time import localtime, strftime
 from typing import Any
 
 from attentionvote.command.entry import command, configuring
+from attentionvote.command.tables import show_table
 from attentionvote.workflows.settings import HistorySettings
 
 log = logging.getLogger("attentionvote.history")
@@ -17,9 +18,6 @@ log = logging.getLogger("attentionvote.history")
 
 def run(cfg: HistorySettings) -> dict[str, Any]:
     """Read the log, show it; the same as data."""
-    from rich.console import Console
-    from rich.table import Table
-
     from attentionvote.registry.history import History, counting
     from attentionvote.registry.promotion import stand
     from attentionvote.registry.versions import Versions
@@ -30,15 +28,12 @@ def run(cfg: HistorySettings) -> dict[str, Any]:
         standing = stand(versions, history, carry_out=False)
         events = history.events()
     counted = {event.number for event in counting(events)}
-    table = Table(title=versions.name, title_justify="left", box=None, pad_edge=False)
-    for name in ("when", "decision", "version", "before", "who", "why"):
-        table.add_column(name, overflow="fold")
-    rows = []
+    rows, cells = [], []
     for event in events[-cfg.last :]:
         void = event.moves and event.number not in counted
         kind = f"{event.kind}, void" if void else event.kind
         when = strftime("%Y-%m-%d %H:%M", localtime(event.when_s))
-        table.add_row(when, kind, str(event.version), str(event.before or ""), event.who, event.why)
+        cells.append((when, kind, str(event.version), str(event.before or ""), event.who, event.why))
         rows.append(
             {
                 "number": event.number,
@@ -55,7 +50,7 @@ def run(cfg: HistorySettings) -> dict[str, Any]:
         )
     champion = standing.champion.number if standing.champion else None
     if events:
-        Console(stderr=True).print(table)
+        show_table(("when", "decision", "version", "before", "who", "why"), cells, versions.name)
     log.info("%s: %s", versions.name, f"the champion is version {champion}" if champion else "there is no champion")
     if standing.astray:
         log.warning("%s", standing.astray)

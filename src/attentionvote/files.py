@@ -34,6 +34,13 @@ def whole(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def remove_leftovers(path: Path) -> None:
+    """Remove what killed processes left of a file that ``whole`` writes; nobody may be writing it now."""
+    for pattern in (f".{path.stem}.*{path.suffix}", f".{path.name}.*"):  # the second are of version 0.1
+        for leftover in path.parent.glob(pattern):
+            leftover.unlink(missing_ok=True)
+
+
 def sync(path: Path) -> None:
     """Wait until a file's content, or the names in a folder, are on the disk, where they survive a power cut."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -85,6 +92,15 @@ def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, also on kill -9
         except BlockingIOError as error:
             raise FolderUnavailable(f"another process is at this {work} ({folder}): wait for it, or end it") from error
+        yield
+
+
+@contextmanager
+def waiting_lock(path: Path) -> Iterator[None]:
+    """Wait until no other process holds this file, and hold it; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
         yield
 
 

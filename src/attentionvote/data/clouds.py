@@ -7,9 +7,9 @@ normals estimated on the whole (denser) cloud. A sample of an epoch is a random 
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from attentionvote.data.cloud_pool import jobs_of, run_scenes
 from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution import Executor
+from attentionvote.files import remove_leftovers, waiting_lock, whole
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
 from attentionvote.simulation.scene_set import SceneSet
@@ -124,9 +125,7 @@ def measure_clouds(
             from there.
     """
     directory = root / part.name / settings.key(scenes.digest)[:16]
-    directory.mkdir(parents=True, exist_ok=True)
-    with (directory / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
+    with waiting_lock(directory / ".lock"):
         create_arrays(directory, len(scenes), settings.pool)
         done = open_arrays(directory, "r")["done"]
         missing = [int(i) for i in np.flatnonzero(done == 0)]
@@ -161,8 +160,6 @@ def create_arrays(directory: Path, scenes: int, pool: int) -> None:
     """Empty arrays for ``scenes`` clouds of at most ``pool`` points, unless they are there."""
     if (directory / "count.npy").exists():
         return
-    for leftover in directory.glob(".*.npy.*"):
-        leftover.unlink()
     shapes: dict[str, tuple[tuple[int, ...], type]] = {
         "points": ((scenes, pool, 3), np.float32),
         "normals": ((scenes, pool, 3), np.int8),
@@ -171,12 +168,15 @@ def create_arrays(directory: Path, scenes: int, pool: int) -> None:
         "count": ((scenes,), np.int32),  # last: its presence says that all are there
     }
     for name, (shape, dtype) in shapes.items():
-        temporary = directory / f".{name}.npy.{os.getpid()}"
-        np.lib.format.open_memmap(temporary, mode="w+", dtype=dtype, shape=shape).flush()
-        # A sparse file would meet a full disk while it is written through the mapping, which kills the process.
-        with temporary.open("r+b") as file:
-            os.posix_fallocate(file.fileno(), 0, temporary.stat().st_size)
-        temporary.replace(directory / f"{name}.npy")
+        remove_leftovers(directory / f"{name}.npy")
+        whole(directory / f"{name}.npy", partial(_empty_array, shape, dtype))
+
+
+def _empty_array(shape: tuple[int, ...], dtype: type, path: Path) -> None:
+    np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape).flush()
+    # A sparse file would meet a full disk while it is written through the mapping, which kills the process.
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
 
 
 def open_arrays(directory: Path, mode: str) -> dict[str, NDArray]:

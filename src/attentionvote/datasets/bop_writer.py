@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from attentionvote.datasets.bop import MISSING
 from attentionvote.datasets.depth_image import TOP, DepthCoding, PinholeCamera, write_image
+from attentionvote.files import write_whole
 
 # Millimetres per count, the finest that holds the picture's depth is taken.
 DEPTH_SCALES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -102,12 +102,8 @@ class BopSceneWriter:
 
     def finish(self) -> None:
         """Write ``scene_gt.json``, ``scene_gt_info.json`` and, last, ``scene_camera.json``."""
-        self._folder.mkdir(parents=True, exist_ok=True)
         for name, content in (("gt", self._gt), ("gt_info", self._info), ("camera", self._cameras)):
-            path = self._folder / f"scene_{name}.json"
-            temporary = path.with_name(f".{path.name}.{os.getpid()}")
-            temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-            temporary.replace(path)
+            write_whole(self._folder / f"scene_{name}.json", json.dumps(content, indent=1) + "\n")
 
 
 def _box(mask: NDArray[np.bool_]) -> list[int]:

@@ -6,7 +6,6 @@ convert it to 8 bits gets a relief of 256 steps and no error.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.files import whole
 from attentionvote.geometry.pointcloud import back_project
 
 MOST_PIXELS = 50_000_000
@@ -157,10 +157,7 @@ def write_image(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> N
     """Write ``(H, W)`` as a grey PNG of its own depth (8 or 16 bits), whole or not at all."""
     from PIL import Image
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3)
-    temporary.replace(path)
+    whole(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3))
 
 
 def _read(path: Path) -> tuple[NDArray[Any], str]:

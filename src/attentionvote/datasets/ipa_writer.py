@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from attentionvote.datasets.ipa import (
     MISSING,
     OPENCV_FROM_IPA,
 )
+from attentionvote.files import write_whole
 
 
 class IpaWriter:
@@ -54,7 +54,7 @@ class IpaWriter:
             "rotation": [1.0, 0.0, 0.0, 0.0],
         }
         folder.mkdir(parents=True, exist_ok=True)
-        _write_text(folder / "parameter.json", json.dumps(parameters, indent=2) + "\n")
+        write_whole(folder / "parameter.json", json.dumps(parameters, indent=2) + "\n")
 
     def write(
         self,
@@ -103,7 +103,7 @@ class IpaWriter:
             rows.writerow([index, self._part_name if index else "bin", *(repr(float(v)) for v in numbers)])
         path = self._folder / "gt" / f"{name}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write_text(path, text.getvalue())
+        write_whole(path, text.getvalue())
         return name
 
 
@@ -127,9 +127,3 @@ def big_picture(camera: PinholeCamera) -> tuple[int, tuple[int, int]]:
     size += int(size - whole[0]) % 2
     offset_x, offset_y = ((size - whole) // 2).tolist()
     return size, (offset_x, offset_y)
-
-
-def _write_text(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

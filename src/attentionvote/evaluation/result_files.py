@@ -8,8 +8,6 @@ without results is the empty list ``[]``: only scenes with a result file are cou
 from __future__ import annotations
 
 import json
-import os
-import uuid
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from attentionvote.evaluation.scene_result import Array, SceneResult
+from attentionvote.files import write_whole
 from attentionvote.geometry.pose import transform
 
 # Sileane's own matrices are orthonormal to 2.6e-6; a detector that writes float32 stays far below this too.
@@ -180,11 +179,4 @@ def _write(path: str | Path, poses: ArrayLike, values: ArrayLike, value_key: str
         {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist(), value_key: float(value)}
         for pose, value in zip(p, v, strict=True)
     ]
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        temporary.write_text(json.dumps(entries, indent=1), encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(Path(path), json.dumps(entries, indent=1))

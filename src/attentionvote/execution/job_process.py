@@ -161,6 +161,11 @@ def cancel_all(jobs: Sequence[JobFuture], grace_s: float = _GRACE_S) -> None:
             job.kill()
 
 
+def end_with_parent() -> None:
+    """Have the kernel end this process, as by kill -9, when the one that started it ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
 def join_starter() -> None:
     """In a job: end (as by kill -9) when the process that started it ends, however it ends; elsewhere nothing.
 
@@ -169,7 +174,7 @@ def join_starter() -> None:
     starter = os.environ.pop(PARENT, None)
     if starter is None:
         return
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    end_with_parent()
     if os.getppid() != int(starter):  # it has ended before we could say so
         os.kill(os.getpid(), signal.SIGKILL)
 

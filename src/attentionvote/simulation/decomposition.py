@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.files import cache_folder
+from attentionvote.files import cache_folder, whole
 from attentionvote.part import Part
 
 log = logging.getLogger(__name__)
@@ -46,11 +46,8 @@ def convex_hulls(part: Part, threshold: float = 0.1, max_vertices: int = 64, cac
             return tuple(stored[f"hull_{i:03d}"] for i in range(len(stored.files)))
     log.info("%s: splitting the surface into convex pieces (once per part, some seconds)", part.name)
     hulls = _decompose(part, threshold, max_vertices)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
-        np.savez(file, **{f"hull_{i:03d}": hull for i, hull in enumerate(hulls)})  # type: ignore[arg-type]
-    temporary.replace(path)
+    pieces: dict[str, Any] = {f"hull_{i:03d}": hull for i, hull in enumerate(hulls)}
+    whole(path, lambda temporary: np.savez(temporary, **pieces))
     return hulls
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part
 from attentionvote.simulation.decomposition import Hulls
+from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.mass import Mass, mass_properties
 
 _SMALL_DIAMETER = 0.040  # below it, time step and contact time constant are halved

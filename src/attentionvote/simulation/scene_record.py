@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.files import whole
 from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix, transform
 from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.raycast import BinSurface
@@ -78,10 +78,7 @@ def save_records(path: Path, records: Sequence[SceneRecord]) -> None:
     part_ids = np.concatenate([np.zeros(0, dtype=np.int32), *(r.part_ids for r in records)])
     if part_ids.any():  # what holds one part only looks as it always did
         fields["part_ids"] = part_ids
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
-        np.savez(file, **fields)  # type: ignore[arg-type]
-    temporary.replace(path)
+    whole(path, lambda temporary: np.savez(temporary, **fields))  # type: ignore[arg-type]
 
 
 def load_records(path: Path) -> list[SceneRecord]:

@@ -8,13 +8,10 @@ occurs in another.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from attentionvote.execution import Executor
+from attentionvote.files import waiting_lock, whole, write_json
 from attentionvote.part import Parts
 from attentionvote.simulation.cycle import simulate_cycle, solids_of
 from attentionvote.simulation.cycle_pool import run_cycles
@@ -114,8 +112,7 @@ def generate_scene_set(
         )
     if workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
-    directory.mkdir(parents=True, exist_ok=True)
-    with _locked(directory):
+    with waiting_lock(directory / ".lock"):
         manifest = _read_manifest(directory)
         if manifest is not None and manifest["spec_digest"] != spec.digest():
             raise ValueError(
@@ -172,10 +169,7 @@ def _frozen_solids(part: Parts, spec: SceneSetSpec, directory: Path) -> list[Sol
             for kind, solid in enumerate(solids_of(part, spec.drop))
             for name, hull in zip(_piece_names(kind, len(solid.hulls)), solid.hulls, strict=True)
         }
-        temporary = directory / f".hulls.npz.{os.getpid()}"
-        with temporary.open("wb") as file:
-            np.savez(file, **pieces)  # type: ignore[arg-type]
-        temporary.replace(path)
+        whole(path, lambda temporary: np.savez(temporary, **pieces))  # type: ignore[arg-type]
     with np.load(path) as stored:
         names = [
             [name for name in _piece_names(kind, len(stored.files)) if name in stored.files]
@@ -210,17 +204,7 @@ def _write_manifest(directory: Path, part: Parts, spec: SceneSetSpec, content: s
         "spec_digest": spec.digest(),
         "content_digest": content,
     }
-    temporary = directory / f".manifest.json.{os.getpid()}"
-    temporary.write_text(json.dumps(manifest, indent=2) + "\n")
-    temporary.replace(directory / "manifest.json")
-
-
-@contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Hold the directory's lock; the system releases it when the process dies, however that happens."""
-    with (directory / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    write_json(directory / "manifest.json", manifest)
 
 
 def find_record(part: Parts, caster: PartCaster, spec: SceneSetSpec, directory: Path, scene: int) -> SceneRecord:

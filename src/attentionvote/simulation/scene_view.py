@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.files import whole
 from attentionvote.geometry.pose import apply
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
@@ -121,9 +121,7 @@ def write_view(directory: Path, part: Parts, caster: PartCaster, record: SceneRe
         "visibility.png": lambda path: _image(path, visible, "visible share of each part", "RdYlGn", record),
     }
     for name, write in files.items():
-        temporary = directory / f".{os.getpid()}-{name}"
-        write(temporary)
-        temporary.replace(directory / name)
+        whole(directory / name, write)
     return {name: directory / name for name in files}
 
 

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from attentionvote.execution.hardware import cores
+
 PACKAGES = ("attentionvote", "torch", "lightning", "mlflow", "numpy", "scipy", "hydra-core", "mujoco-core", "trimesh")
 PATCH_LIMIT_BYTES = 1_000_000
 _PLACES = ("index", "objects")
@@ -159,7 +161,7 @@ def hardware() -> dict[str, str]:
 
     return {
         "cpu": _cpu_model(),
-        "cores": str(len(os.sched_getaffinity(0))) if hasattr(os, "sched_getaffinity") else str(os.cpu_count()),
+        "cores": str(cores()),
         "memory_gib": f"{psutil.virtual_memory().total / 2**30:.1f}",
         "gpu": ", ".join(gpu_names()) or "none",
         "host": platform.node(),

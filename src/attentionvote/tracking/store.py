@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import fcntl
 import logging
 import os
 import re
@@ -14,6 +13,8 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from attentionvote.files import waiting_lock
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -119,9 +120,7 @@ def exclusive(uri: str) -> Iterator[None]:
     """
     if uri.startswith("sqlite:///"):
         path = Path(uri.removeprefix("sqlite:///"))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.with_name(path.name + ".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel even on kill -9
+        with waiting_lock(path.with_name(path.name + ".lock")):
             yield
     elif uri.startswith("postgresql"):
         from sqlalchemy import create_engine, text

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from attentionvote.files import remove_leftovers, whole
 from attentionvote.model.network import AttentionVote
 
 log = logging.getLogger(__name__)
@@ -31,21 +32,20 @@ def write_atomically(content: Mapping[str, Any], path: Path) -> None:
     """
     buffer = io.BytesIO()
     torch.save(dict(content), buffer)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
             file.write(buffer.getbuffer())
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+
+    try:
+        whole(path, write)
     except OSError as error:
         raise OSError(
             f"checkpoint {path} cannot be written ({error.strerror or error}); the one before it is kept, "
             "the same command goes on from there"
         ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def usable_checkpoint(paths: Sequence[Path], shapes: Mapping[str, torch.Size]) -> Path | None:
@@ -59,8 +59,7 @@ def usable_checkpoint(paths: Sequence[Path], shapes: Mapping[str, torch.Size]) -
         shapes: of the module's weights by name.
     """
     for path in paths:
-        for leftover in path.parent.glob(f".{path.name}.*"):
-            leftover.unlink(missing_ok=True)
+        remove_leftovers(path)
         if not path.is_file():
             continue
         try:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any
 
+from attentionvote.command.tables import show_table
+
 if TYPE_CHECKING:
     from attentionvote.datasets.check import Report
 
@@ -34,20 +36,14 @@ def as_data(report: Report) -> dict[str, Any]:
 
 def show(reports: list[Report]) -> None:
     """A table on stderr, and every finding under it."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for name in ("format", "dataset", "split"):
-        table.add_column(name, overflow="fold")
-    for name in ("scenes", ">= 5 drops", "expected", "opened", "parts", "off", "wrong"):
-        table.add_column(name, justify="right")
+    numbers = ("scenes", ">= 5 drops", "expected", "opened", "parts", "off", "wrong")
+    rows = []
     for report in reports:
         dataset, placement = report.dataset, report.placement
         counts = (len(dataset.names), report.scored, report.expected, report.opened, report.instances)
         cells = ["-" if value is None else f"{value}" for value in (*counts, placement.misplaced, len(report.errors))]
-        table.add_row(dataset.format, dataset.title, dataset.split, *cells)
-    Console(stderr=True).print(table)
+        rows.append((dataset.format, dataset.title, dataset.split, *cells))
+    show_table(("format", "dataset", "split", *numbers), rows, numbers=numbers)
     for report in reports:
         for finding in report.findings:
             (log.error if finding.severity == "error" else log.warning)("%s", finding.sentence)

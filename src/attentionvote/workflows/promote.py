@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from attentionvote.command.errors import ConfigurationError, Refused
+from attentionvote.command.tables import show_table
 from attentionvote.inference import Bundle
 from attentionvote.measurement.models import Measurement
 from attentionvote.measurement.scenes import MeasuredScenes
@@ -176,13 +177,6 @@ class PromotionJob:
 
 
 def _show_gates(gates: Sequence[Gate], against: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"gates, {against}", title_justify="left", box=None, pad_edge=False)
-    for name in ("", "gate", "demands", "found"):
-        table.add_column(name, overflow="fold")
-    for gate in gates:
-        mark = "[green]holds[/]" if gate.holds else "[bold red]FAILS[/]"
-        table.add_row(mark, gate.name, gate.demands, gate.finding)
-    Console(stderr=True).print(table)
+    marks = {True: "[green]holds[/]", False: "[bold red]FAILS[/]"}
+    rows = [(marks[gate.holds], gate.name, gate.demands, gate.finding) for gate in gates]
+    show_table(("", "gate", "demands", "found"), rows, f"gates, {against}")

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from attentionvote.command.tables import show_table
 from attentionvote.measurement.figures import figures_of, machine
 from attentionvote.workflows.evaluate.frozen_set import is_recorded
 
@@ -48,25 +49,19 @@ def described(job: EvaluationJob, frozen: MeasuredScenes, measured: Measurement)
 
 def show(result: Mapping[str, Any]) -> None:
     """A table on stderr."""
-    from rich.console import Console
-    from rich.table import Table
-
     figures, sure = result["figures"], result["intervals"]
     head = f"{result['object']}, bundle {result['bundle'][:12]}, {result['scenes']} scenes"
-    table = Table(title=head, title_justify="left", box=None, pad_edge=False)
-    for name in ("figure", "value", "95 % interval"):
-        table.add_column(name, justify="left" if name == "figure" else "right")
-    for name, title in _TITLES.items():
-        table.add_row(title, f"{figures[name]:.4f}", "{:.3f} to {:.3f}".format(*sure[name]))
+    columns = ("figure", "value", "95 % interval")
+    rows = [(title, f"{figures[name]:.4f}", "{:.3f} to {:.3f}".format(*sure[name])) for name, title in _TITLES.items()]
     for name, value in figures.items():
         if name.startswith("recall_visible_"):
             low, high = name.split("_")[-2:]
-            table.add_row(f"recall, {low}-{high} % visible", f"{value:.4f}")
+            rows.append((f"recall, {low}-{high} % visible", f"{value:.4f}", ""))
     for name, title, unit in (("center_error_mm", "centre, median", "mm"), ("rotation_error_deg", "turn, median", "°")):
         if name in figures:
-            table.add_row(title, f"{figures[name]:.2f} {unit}")
-    table.add_row("an estimate, p50 / p95", "{latency_p50_ms:.0f} / {latency_p95_ms:.0f} ms".format(**figures))
-    Console(stderr=True).print(table)
+            rows.append((title, f"{figures[name]:.2f} {unit}", ""))
+    rows.append(("an estimate, p50 / p95", "{latency_p50_ms:.0f} / {latency_p95_ms:.0f} ms".format(**figures), ""))
+    show_table(columns, rows, head, numbers=columns[1:])
 
 
 def record(store: str | None, run_id: str, result: Mapping[str, Any], name: str, figures: bool) -> None:

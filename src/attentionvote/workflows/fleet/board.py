@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from attentionvote.command.tables import show_table
 from attentionvote.files import write_json, write_whole
 from attentionvote.inference import BundleError, load_bundle
 from attentionvote.registry.versions import DATA_FACT
@@ -122,15 +123,7 @@ def best_first(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def show(rows: Sequence[Mapping[str, Any]]) -> None:
     """The table on stderr."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"{len(rows)} parts", title_justify="left", box=None, pad_edge=False)
-    for name in _HEAD:
-        table.add_column(name, overflow="fold")
-    for entry in rows:
-        table.add_row(*cells(entry))
-    Console(stderr=True).print(table)
+    show_table(_HEAD, [cells(entry) for entry in rows], f"{len(rows)} parts")
 
 
 def write(folder: Path, rows: Sequence[dict[str, Any]], left_out: Mapping[str, str]) -> Path:

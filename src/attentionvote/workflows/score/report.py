@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from attentionvote.command.tables import show_table
+
 COLUMNS = {
     "sileane": ("ap", "f1", "map", "r99", "r50", "tp", "fp", "fn"),
     "bop": ("map", "map_mm", "targets", "estimates"),
@@ -14,19 +16,11 @@ ROWS = {"sileane": "per_scene", "bop": "per_object"}
 
 def show(result: Mapping[str, Any]) -> None:
     """One row a scene (Sileane) or an object (BOP), and one of all together."""
-    from rich.console import Console
-    from rich.table import Table
-
     kind = str(result["format"])
-    table = Table(title=_title(result), title_justify="left", box=None, pad_edge=False)
-    table.add_column(ROWS[kind].removeprefix("per_"))
-    for name in COLUMNS[kind]:
-        table.add_column(name, justify="right")
     overall = {"map": result["bop25_mAP"], "map_mm": result["bop25_mAP_mm"]} if kind == "bop" else {}
     rows = {**result[ROWS[kind]], "all": {**result, **overall}}
-    for name, figures in rows.items():
-        table.add_row(str(name), *(_shown(figures[column]) for column in COLUMNS[kind]))
-    Console(stderr=True).print(table)
+    cells = [(str(name), *(_shown(row[column]) for column in COLUMNS[kind])) for name, row in rows.items()]
+    show_table((ROWS[kind].removeprefix("per_"), *COLUMNS[kind]), cells, _title(result), numbers=COLUMNS[kind])
 
 
 def _title(result: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from attentionvote.command.tables import show_table
 from attentionvote.files import write_json
 from attentionvote.workflows.page_sections import record_of, stored_beside
 
@@ -76,17 +77,9 @@ def markdown(names: Sequence[str], rows: Rows) -> str:
 
 def show(names: Sequence[str], rows: Rows) -> None:
     """The same on stderr."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for title in ("row", "of", "ours", "beside it", "to reach", "", "equal"):
-        table.add_column(title)
-    for name in names:
-        if name in rows:
-            _, size, *rest = (cell.replace("**", "") for cell in _cells(rows[name]))
-            table.add_row(name, size, *rest)
-    Console(stderr=True, width=None if os.isatty(2) else 200).print(table)
+    cells = [(name, *(cell.replace("**", "") for cell in _cells(rows[name])[1:])) for name in names if name in rows]
+    columns = ("row", "of", "ours", "beside it", "to reach", "", "equal")
+    show_table(columns, cells, width=None if os.isatty(2) else 200)
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:

@@ -7,10 +7,8 @@ makes the data, tracks the run, writes the results and speaks.
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,10 +17,10 @@ from typing import Any
 
 from attentionvote.command.errors import ConfigurationError, sentence
 from attentionvote.execution.hardware import cores
+from attentionvote.execution.job_process import end_with_parent
 
 FirstDoes = Callable[[str, Callable[[], Any]], Any]  # see ``attentionvote.training.processes``
 _VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class TrainingProcess:
     def joined(self, accelerator: str) -> Iterator[FirstDoes]:
         """Meet the others; yields what lets the first work alone while they wait."""
         if "TORCHELASTIC_RUN_ID" in os.environ:  # torchrun killed with -9 leaves no orphans that hold the folder
-            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+            end_with_parent()
         if self.processes == 1:
             yield lambda _, work: work()
             return

@@ -1,0 +1,120 @@
+"""Files that survive a kill: whole or not at all, one process a folder, one cache folder."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from attentionvote.files import (
+    FolderUnavailable,
+    cache_folder,
+    is_locked,
+    locked_folder,
+    read_json,
+    remove_leftovers,
+    waiting_lock,
+    whole,
+    write_json,
+    write_whole,
+)
+
+
+def test_a_file_is_written_whole_or_stays_what_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    write_whole(path, "one\r\n")
+    assert path.read_bytes() == b"one\r\n"
+
+    def half(temporary: Path) -> None:
+        assert temporary.suffix == ".txt"
+        temporary.write_text("ha")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        whole(path, half)
+    assert path.read_bytes() == b"one\r\n"
+    assert [entry.name for entry in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_leftovers_of_one_file_are_removed_and_no_other(tmp_path: Path) -> None:
+    for name in (".last.7.ckpt", ".last.ckpt.7", "last.ckpt", ".best.7.ckpt", "last.7.ckpt"):
+        (tmp_path / name).touch()
+    remove_leftovers(tmp_path / "last.ckpt")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == [".best.7.ckpt", "last.7.ckpt", "last.ckpt"]
+
+
+def test_json_that_is_damaged_is_passed_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "a.json"
+    assert read_json(path) is None
+    write_json(path, {"a": 1})
+    assert read_json(path) == {"a": 1}
+    assert not caplog.records
+    for damaged in ("{", "[1]"):
+        path.write_text(damaged)
+        assert read_json(path) is None
+    assert caplog.messages == [f"{path} is damaged and is passed over"] * 2
+
+
+def test_one_process_a_folder_and_a_killed_one_leaves_it_free(tmp_path: Path) -> None:
+    program = (
+        "import sys, time; from pathlib import Path; from attentionvote.files import locked_folder\n"
+        "with locked_folder(Path(sys.argv[1]), 'x', 'training'): print('in', flush=True); time.sleep(60)"
+    )
+    folder = tmp_path / "results"
+    assert not is_locked(folder)
+    other = subprocess.Popen([sys.executable, "-c", program, str(folder)], stdout=subprocess.PIPE)
+    assert other.stdout is not None
+    assert other.stdout.readline() == b"in\n"
+    assert is_locked(folder)
+    with (
+        pytest.raises(FolderUnavailable, match="another process is at this training"),
+        locked_folder(folder, "x", "training"),
+    ):
+        pass
+    other.kill()
+    other.wait()
+    other.stdout.close()
+    assert not is_locked(folder)
+    with locked_folder(folder, "x", "training"):
+        assert is_locked(folder)
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(FolderUnavailable, match=r"^outputs=here cannot be written: Not a directory$"),
+        locked_folder(tmp_path / "file" / "x", "here", "training"),
+    ):
+        pass
+
+
+def test_who_waits_for_a_lock_comes_after_whoever_has_it(tmp_path: Path) -> None:
+    order = []
+
+    def second() -> None:
+        with waiting_lock(tmp_path / "new" / ".lock"):
+            order.append("second")
+
+    with waiting_lock(tmp_path / "new" / ".lock"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        thread.join(0.2)
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
+
+
+def test_one_cache_folder_for_everything(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("ATTENTIONVOTE_CACHE", "")  # not the current folder
+    assert cache_folder() == tmp_path / ".cache" / "attentionvote"
+    monkeypatch.setenv("XDG_CACHE_HOME", "/x")
+    assert cache_folder() == Path("/x/attentionvote")
+    monkeypatch.setenv("ATTENTIONVOTE_CACHE", "/y")
+    assert cache_folder() == Path("/y")
+    assert os.environ["ATTENTIONVOTE_CACHE"] == "/y"
