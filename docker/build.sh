@@ -3,7 +3,7 @@
 # base image, PIP_CONF a pip.conf for the build alone; more arguments go to the builder (--target mlflow, ...).
 set -eu
 cd "$(dirname "$0")/.."
-version=$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' src/attentionvote/__init__.py)
 image="${1:-attentionvote:$version}"
 [ $# -eq 0 ] || shift
 revision=$(git rev-parse HEAD 2>/dev/null || echo unknown)

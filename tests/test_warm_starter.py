@@ -137,20 +137,21 @@ def begun() -> Iterator[list[warm_starter.Popen]]:
 
 
 @pytest.mark.parametrize(
-    ("settings", "warm"),
+    ("changes", "settings", "warm"),
     [
-        ({}, True),
-        ({"env": {**os.environ, "MLFLOW_TRACKING_URI": "sqlite:///x"}}, True),
-        ({"env": {**os.environ, "OMP_NUM_THREADS": "2"}}, False),
-        ({"env": {**os.environ, "PYTHONPATH": "/elsewhere"}}, False),
-        ({"env": {}}, False),
-        ({"preexec_fn": os.getpid}, False),
-        ({"process_group": 0}, False),
+        ({}, {}, True),
+        ({"MLFLOW_TRACKING_URI": "sqlite:///x"}, {}, True),
+        ({"OMP_NUM_THREADS": "2"}, {}, False),
+        ({"PYTHONPATH": "/elsewhere"}, {}, False),
+        ({}, {"env": {}}, False),
+        ({}, {"preexec_fn": os.getpid}, False),
+        ({}, {"process_group": 0}, False),
     ],
-)  # fmt: skip
+)
 def test_what_a_fork_would_not_be_is_a_real_start(
-    begun: list[warm_starter.Popen], settings: dict[str, Any], warm: bool
+    begun: list[warm_starter.Popen], changes: dict[str, str], settings: dict[str, Any], warm: bool
 ) -> None:
+    settings = {"env": {**os.environ, **changes}, **settings}  # as it is now: other tests have set variables
     process = warm_starter.Popen([sys.executable, "-c", "import time; time.sleep(100)"], **settings)
     begun.append(process)
     assert process.warm == warm

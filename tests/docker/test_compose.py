@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+import attentionvote
 from attentionvote.inference.server import serve
 from attentionvote.inference.server.model.source import source_of
 
@@ -46,10 +47,9 @@ def test_a_container_may_do_no_more_than_it_must(compose: dict[str, Any], name: 
 
 
 def test_the_images_are_built_here_with_fixed_versions(compose: dict[str, Any], stages: dict[str, Any]) -> None:
-    version = (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition('\nversion = "')[2].partition('"')[0]
     tracking = (ROOT / "constraints.txt").read_text(encoding="utf-8").partition("\nmlflow==")[2].partition("\n")[0]
     services = compose["services"]
-    assert services["inference"]["image"] == f"attentionvote:{version}"
+    assert services["inference"]["image"] == f"attentionvote:{attentionvote.__version__}"
     assert services["mlflow"]["image"] == services["mlflow-team"]["image"] == f"attentionvote-mlflow:{tracking}"
     assert re.fullmatch(r"docker\.io/library/postgres:15\.\d+-bookworm", services["postgres"]["image"])
     for name, service in services.items():

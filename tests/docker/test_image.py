@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cell_image import NAME, CannotBuildError, Tools, build_image, find_tools
 
+import attentionvote
+
 if TYPE_CHECKING:
     from conftest import Cell
 
@@ -108,7 +110,7 @@ def test_the_configuration_is_the_dockerfiles(tools: Tools, image: dict[str, Any
     assert set(image["Volumes"]) == {"/state"}
     labels = image["Labels"]
     assert labels["org.opencontainers.image.title"] == "attentionvote"
-    assert labels["org.opencontainers.image.version"][0].isdigit()
+    assert labels["org.opencontainers.image.version"] == attentionvote.__version__
     assert labels["org.opencontainers.image.revision"].startswith(tools.run("git", "rev-parse", "HEAD").strip())
 
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import pytest
 from attentionvote.inference.bundles.bundle import Bundle, load_bundle
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.server.deadline import Deadline
+from attentionvote.inference.server.worker import workers as workers_module
 from attentionvote.inference.server.worker.channel import Message, SharedContent
 from attentionvote.inference.server.worker.process import WorkerLost, WorkerProcess, WorkerSettings
 from attentionvote.inference.server.worker.workers import Workers
@@ -139,24 +141,26 @@ def test_a_job_that_hangs_keeps_the_next_ones_waiting_for_a_second(workers: Work
         assert hanging.result(PATIENCE_S) is not None
 
 
-def test_jobs_are_done_in_their_order(make_bundle: Make, trusted_key: Path, make_cloud: Any, npy: Any) -> None:
+def test_jobs_are_done_in_their_order(
+    make_bundle: Make, trusted_key: Path, make_cloud: Any, npy: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers_module, "_PATIENCE_S", 1000.0)  # on a busy machine the spare would take the next
     slow = Workers(load_bundle(make_bundle(graph={"loops": 100_000}), trusted_key), WorkerSettings())
-    wait_for(lambda: slow._spare is not None)
     done: list[int] = []
 
     def job(number: int) -> None:
         assert ask(slow, npy(make_cloud(seed=number))) is not None
         done.append(number)
 
-    with ThreadPoolExecutor(4) as pool:
-        jobs = []
-        for number in range(4):
+    with closing(slow), ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(job, 0)]
+        wait_for(lambda: slow._active in slow._since or bool(done))
+        for number in range(1, 4):
             jobs.append(pool.submit(job, number))
-            wait_for(lambda expected=number + 1: len(slow._line) + len(slow._since) + len(done) >= expected)
-        for one in jobs:
-            one.result(PATIENCE_S)
+            wait_for(lambda before=number: len(slow._line) + len(done) >= before)  # one is at work
+        for answer in jobs:
+            answer.result(PATIENCE_S)
     assert done == [0, 1, 2, 3]
-    slow.close()
 
 
 def test_retired_workers_end_when_nobody_holds_them(workers: Workers) -> None:
