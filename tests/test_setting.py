@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from attentionvote.model.settings import NetworkSettings
 from attentionvote.section import Target, check, check_value, find, leaves, read
 from attentionvote.setting import ChoicesOf, Setting, SettingError, fields_of
 
@@ -46,6 +47,18 @@ class Camera:
     extra: Annotated[Any, Setting("Anything.")] = None
 
 
+@dataclass(frozen=True)
+class Network:
+    """A section with one that checks itself."""
+
+    model: NetworkSettings
+
+
+SMALL: dict[str, Any] = {
+    "centers": [4, 3, 2, 1], "neighbors": [2] * 4, "widths": [[4]] * 4, "propagation": [4], "residual": False,
+    "radius_fraction": 0.1, "voxel_fraction": 0.1, "voting": [4], "proposals": 2, "gathered": 2, "fusion": [4],
+    "head": [4],
+}  # fmt: skip
 PLAIN: dict[str, Any] = {"name": "left", "lens": {"focal": 2}, "pixels": [4, 3]}
 
 
@@ -146,6 +159,34 @@ def test_a_section_with_a_target_is_checked_against_its_signature_and_called() -
     for wrong in ("nowhere.make", f"{__name__}.nothing", f"{__name__}.KINDS", "x"):
         with pytest.raises(SettingError, match=f"must be the dotted name of a class or function; got '{wrong}'"):
             Target.of({"_target_": wrong}, "object")
+
+
+def anything(name: str, **more: int) -> tuple[str, dict[str, int]]:
+    """A target that takes arguments of every name."""
+    return name, more
+
+
+def later(name: "Unknown") -> str:  # type: ignore[name-defined]  # noqa: UP037
+    """A target annotated with a name that only type checkers know."""
+    return name
+
+
+def test_targets_of_a_users_own_are_called_as_they_are() -> None:
+    assert Target.of({"_target_": f"{__name__}.anything", "name": "a", "size": 3})() == ("a", {"size": 3})
+    assert Target.of({"_target_": f"{__name__}.later", "name": "a"})() == "a"
+    inner = {"_target_": f"{__name__}.make", "name": "b"}
+    assert Target.of({"_target_": f"{__name__}.later", "name": inner})() == ("b", 0.5)
+    raw = Target.of({"_target_": f"{__name__}.later", "_recursive_": False, "name": inner})
+    assert raw() == inner
+    with pytest.raises(SettingError, match="must be a class or function with a signature"):
+        Target.of({"_target_": "builtins.dict", "name": 1})
+    with pytest.raises(SettingError, match=r"^object takes its arguments by name, got _args_: leave it out$"):
+        Target.of({"_target_": f"{__name__}.make", "_args_": [1]}, "object")
+
+
+def test_a_section_that_does_not_fit_together_is_named_in_full() -> None:
+    with pytest.raises(SettingError, match=r"^model.head must have at least one width; got \[\]$"):
+        read(Network, {"model": SMALL | {"head": []}})
 
 
 def test_choices_that_take_seconds_to_import_are_looked_up_for_others_alone() -> None:

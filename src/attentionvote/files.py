@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
@@ -82,6 +81,8 @@ def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs
     Raises:
         FolderUnavailable: when the folder cannot be written, or another process is in it.
     """
+    import fcntl  # of Unix; what only reads and writes needs no locks
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")
@@ -98,6 +99,8 @@ def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs
 @contextmanager
 def waiting_lock(path: Path) -> Iterator[None]:
     """Wait until no other process holds this file, and hold it; its folder is made."""
+    import fcntl
+
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
@@ -106,6 +109,8 @@ def waiting_lock(path: Path) -> Iterator[None]:
 
 def is_locked(folder: Path) -> bool:
     """Whether a process is in the folder; False when there is no such folder."""
+    import fcntl
+
     try:
         lock = (folder / ".lock").open("r+")
     except OSError:

@@ -9,7 +9,16 @@ from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, TypeVar, get_args, get_origin
 
-from attentionvote.setting import Field, Setting, SettingError, fields_of, scalar_problem, wanted, without_null
+from attentionvote.setting import (
+    Field,
+    Setting,
+    SettingError,
+    fields_of,
+    scalar_problem,
+    takes_any_name,
+    wanted,
+    without_null,
+)
 
 _Section = TypeVar("_Section")
 
@@ -64,10 +73,17 @@ class Target:
             raise SettingError(
                 f"{key or 'a section'} must have _target_, the dotted name of what it configures; got none"
             )
-        # Other keys that begin with an underscore steer Hydra's own way of calling a target.
+        for name in ("_args_", "_partial_"):
+            if name in values:
+                raise SettingError(f"{key or 'a section'} takes its arguments by name, got {name}: leave it out")
+        # _recursive_ and _convert_ steer Hydra's own way of calling a target.
         arguments = {str(name): item for name, item in values.items() if not str(name).startswith("_")}
         path = str(values["_target_"])
         _arguments(located(path), arguments, key)
+        if values.get("_recursive_", True):
+            for name, item in arguments.items():
+                if isinstance(item, Mapping) and "_target_" in item:
+                    arguments[name] = cls.of(item, f"{key}.{name}" if key else name)
         return cls(path, arguments)
 
     @property
@@ -77,7 +93,8 @@ class Target:
 
     def __call__(self) -> Any:
         """What the section configures; errors are those of its target."""
-        return located(self.path)(**self.arguments)
+        made = {name: item() if isinstance(item, Target) else item for name, item in self.arguments.items()}
+        return located(self.path)(**made)
 
 
 def located(path: str) -> Any:
@@ -110,8 +127,8 @@ def read(section: type[_Section], values: Mapping[str, Any], key: str = "") -> _
     arguments = _arguments(section, values, key)
     try:
         return section(**arguments)
-    except SettingError:
-        raise
+    except SettingError as error:  # each value fits, so this is of the section's own and names a field of it
+        raise SettingError(f"{key}.{error}" if key else str(error)) from error
     except ValueError as error:
         raise SettingError(str(error)) from error
 
@@ -145,10 +162,16 @@ def check(section: Any) -> None:
 
 
 def _arguments(section: Any, values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    fields = fields_of(section)
+    try:
+        fields, takes_any = fields_of(section), takes_any_name(section)
+    except ValueError as error:  # of a builtin, which tells nothing of its arguments
+        raise SettingError(f"_target_ must be a class or function with a signature; got {section!r}") from error
     arguments = {}
     for name, value in values.items():
         inner = f"{key}.{name}" if key else name
+        if name not in fields and takes_any:
+            arguments[name] = value
+            continue
         if name not in fields:
             close = get_close_matches(name, fields, n=1)
             hint = f", did you mean {inner.removesuffix(name) + close[0]!r}?" if close else ""

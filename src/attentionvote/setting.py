@@ -21,6 +21,7 @@ from functools import cache
 from importlib import import_module
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+_VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 _NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
 
 
@@ -93,7 +94,10 @@ def fields_of(section: Any) -> dict[str, Field]:
 
 @cache
 def _fields_of(section: Any) -> dict[str, Field]:
-    hints = get_type_hints(section, include_extras=True)
+    try:
+        hints = get_type_hints(section, include_extras=True)
+    except NameError:  # a function of the user's, annotated with names that are imported for type checks alone
+        hints = {}
     if dataclasses.is_dataclass(section):
         missing = dataclasses.MISSING
         entries = [
@@ -102,9 +106,16 @@ def _fields_of(section: Any) -> dict[str, Field]:
             if f.init
         ]
     else:
-        parameters = inspect.signature(section).parameters.values()
+        parameters = [p for p in inspect.signature(section).parameters.values() if p.kind not in _VARIABLE]
         entries = [(p.name, ... if p.default is inspect.Parameter.empty else p.default) for p in parameters]
     return {name: _field(hints.get(name, Any), default) for name, default in entries}
+
+
+def takes_any_name(section: Any) -> bool:
+    """Whether a function takes arguments of every name."""
+    if dataclasses.is_dataclass(section):
+        return False
+    return any(p.kind is inspect.Parameter.VAR_KEYWORD for p in inspect.signature(section).parameters.values())
 
 
 def _field(hint: Any, default: Any) -> Field:
@@ -148,6 +159,10 @@ def scalar_problem(value: Any, type_: Any, setting: Setting, nullable: bool) -> 
 
 def wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
     """Type and range of a setting in words."""
+    if get_origin(type_) is Literal:
+        return f"one of {', '.join(map(str, get_args(type_)))}"
+    if setting.choices:
+        return setting.range_text()
     if not isinstance(type_, type) or type_ not in _NOUNS:
         return "a section" if dataclasses.is_dataclass(type_) else setting.range_text() or "a list"
     bounds = setting.range_text()

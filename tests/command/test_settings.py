@@ -14,10 +14,12 @@ from settings_of_verbs import settings_of
 from attentionvote.command.conf_folder import CONF, SCRIPTS, choices, primary_groups
 from attentionvote.command.configuration import compose, leaves
 from attentionvote.command.errors import ConfigurationError
+from attentionvote.command.help import help_text
 from attentionvote.model.fusion import FUSIONS
 from attentionvote.section import Target, check_value, find
 from attentionvote.section import leaves as fields_below
 from attentionvote.setting import Field, SettingError, without_null
+from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
 VERBS = sorted(path.stem for path in CONF.glob("*.yaml"))
@@ -119,6 +121,13 @@ def test_every_number_has_bounds_on_both_sides_and_beyond_them_a_sentence(verb: 
         ("+data.sensor.edge_dropout=2", "data.sensor.edge_dropout must be at least 0 and at most 1; got 2"),
         ("object.diameter=-1", "object.diameter must be a number greater than 0 and at most 10; got -1"),
         ("+object.colour=red", "there is no setting 'object.colour'"),
+        ("data.sensor.edge_dropout=0.2",
+         "data.sensor.edge_dropout is not in conf/, so it is added: +data.sensor.edge_dropout=0.2"),
+        ("~model.classes", "model.classes can be changed, not taken away, got '~model.classes': give it a value"),
+        ("+model._target_=mine.Network",
+         "model._target_ must be left out or attentionvote.model.AttentionVote; got 'mine.Network'"),
+        ("model.centers=[512,256]", "model.centers must have 4 entries, one a level; got [512, 256]"),
+        ("object.symmetry=3", "object.symmetry must be a section with keys kind, axis, flip; got 3"),
     ],
 )  # fmt: skip
 def test_an_impossible_value_is_one_sentence(words: str, sentence: str) -> None:
@@ -127,10 +136,30 @@ def test_an_impossible_value_is_one_sentence(words: str, sentence: str) -> None:
     assert str(refused.value) == sentence
 
 
-def test_settings_that_conf_leaves_out_can_be_added() -> None:
-    settings = compose(TrainSettings, ["object=gear", "+data.sensor.edge_dropout=0.2"])
+@pytest.mark.parametrize("plus", ["+", "++"])
+def test_settings_that_conf_leaves_out_can_be_added(plus: str) -> None:
+    settings = compose(TrainSettings, ["object=gear", f"{plus}data.sensor.edge_dropout=0.2"])
     assert settings.data.sensor.edge_dropout == 0.2
     assert settings.composed["data"]["sensor"] == {"preset": "gaussian", "sigma_mm": 0.3, "edge_dropout": 0.2}
+
+
+def test_a_file_of_conf_model_may_name_its_class_as_before_0_2() -> None:
+    plain = ["object=gear", "experiment=smoke"]
+    before = compose(TrainSettings, [*plain, "+model._target_=attentionvote.model.AttentionVote"])
+    assert find_training(before).directory == find_training(compose(TrainSettings, plain)).directory
+
+
+def test_help_says_type_range_and_meaning_of_every_setting() -> None:
+    text = help_text(TrainSettings, CONF)
+    for line in (
+        '  loss.settings.rotation="metric"\n      Distance of rotations, see training/pose_loss.py. '
+        "[one of metric, slerp, minra, nlerp]",
+        "  workers=null\n      Processes for generation and clouds; null = one per core of this machine. "
+        "[a whole number at least 1 and at most 1024]",
+        "  +data.sensor.dropout=0.01\n      phoxi: share of points lost anywhere. [a number at least 0 and at most 1]",
+    ):
+        assert line in text
+    assert text.count("splits never share a cycle") == 1
 
 
 @pytest.mark.parametrize("key", ["tracking.store", "storage"])

@@ -192,7 +192,7 @@ def test_confidence_is_clamped_or_a_probability(make_network: Callable) -> None:
         ({"proposal_source": "nms"}, "proposal_source must be one of heatmap, fps; got 'nms'"),
         ({"fusion_kind": "max"}, "fusion_kind must be one of aml, amx, pn; got 'max'"),
         ({"center": 1}, "there is no setting 'center', did you mean 'centers'"),
-        ({"centers": [48, 24, 12]}, "a layout must have four levels of centers, neighbors and radii, got 3, 4 and 4"),
+        ({"centers": [48, 24, 12]}, "centers must have 4 entries, one a level; got"),
     ],
 )
 def test_impossible_arguments_are_refused(changes: dict, words: str) -> None:

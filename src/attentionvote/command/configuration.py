@@ -5,7 +5,7 @@ with the nearest valid name, before any work starts:
 
 * a group choice that does not exist (``object=conecting_rod``) or a group that must be chosen;
 * a setting that does not exist (``trainer.max_epoch=3``, ``lr=1``);
-* a value of another type than the default it replaces (``trainer.lr=abc``);
+* a value of another type than the default it replaces (``trainer.learning_rate=abc``);
 * a value outside its range (on its field, see ``setting.py``);
 * an interpolation or a mandatory value that cannot be resolved.
 """
@@ -89,11 +89,11 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
     if values:
         base = _defaults(verb, tuple(str(o.input_line) for o in parsed if o not in values), conf, _state(conf))
         for override in values:
-            _check_key(override, base, conf)
+            _check_key(settings, override, base, conf)
     final = _plain(_compose(verb, overrides, conf))
     for override in values:
         key = override.key_or_group
-        if not (override.is_add() or override.is_delete()):
+        if not (override.is_add() or override.is_force_add() or override.is_delete()):
             check_types(settings, key, _select(base, key), _final_value(final, override), base)
     try:
         return settings.of(final)
@@ -162,13 +162,18 @@ def _check_choice(override: Override, conf: Path) -> None:
             raise ConfigurationError(_choice_problem(override.key_or_group, shown, conf))
 
 
-def _check_key(override: Override, base: dict[str, Any], conf: Path) -> None:
+def _check_key(settings: type[VerbSettings], override: Override, base: dict[str, Any], conf: Path) -> None:
     key = override.key_or_group
-    if override.is_add():
+    if override.is_add() or override.is_force_add():
         return
+    field = find(settings, key, base)
+    if override.is_delete() and field is not None and field.default is not ...:
+        raise ConfigurationError(f"{key} can be changed, not taken away, got {override.input_line!r}: give it a value")
     try:
         _select(base, key)
     except KeyError:
+        if field is not None and field.default is not ...:
+            raise ConfigurationError(f"{key} is not in conf/, so it is added: +{override.input_line}") from None
         keys = [k for k, _ in leaves(base)]
         sections = {k.rsplit(".", n)[0] for k in keys for n in range(1, k.count(".") + 1)}
         hint = nearest(key, [*(g for g in groups(conf) if "." not in key), *keys, *sorted(sections)])
@@ -206,7 +211,7 @@ def check_types(
     Null is left to the setting's own type, on both sides.
 
     Args:
-        values: of the settings, see ``setting.find``.
+        values: of the settings, see ``section.find``.
     """
     setting = find(settings, key, values)
     nullable = setting is not None and without_null(setting.type)[1]
@@ -214,14 +219,15 @@ def check_types(
         return
     if isinstance(default, Mapping):
         if not isinstance(value, Mapping):
-            raise ConfigurationError(f"{key} must be a section with keys {', '.join(map(str, default))}; got {value!r}")
+            names = ", ".join(map(str, default))
+            raise ConfigurationError(f"{key} must be a section with keys {names}; got {_shown(value)}")
         for name in value:
             if name in default:
                 check_types(settings, f"{key}.{name}", default[name], value[name], values)
         return
     if isinstance(default, list):
         if not isinstance(value, list):
-            raise ConfigurationError(f"{key} must be a list such as {default}; got {value!r}")
+            raise ConfigurationError(f"{key} must be a list such as {default}; got {_shown(value)}")
         if default and not value:
             raise ConfigurationError(f"{key} must not be empty, a list such as {default}; got []")
         for index, item in enumerate(value if default else ()):
@@ -229,9 +235,12 @@ def check_types(
         return
     problem = type_problem(default, value)
     if problem:
-        raise ConfigurationError(
-            f"{key} must be {problem} such as {default}; got {'null' if value is None else repr(value)}"
-        )
+        example = f" such as {default}" if default != "" else ""
+        raise ConfigurationError(f"{key} must be {problem}{example}; got {_shown(value)}")
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else repr(value)
 
 
 def type_problem(default: object, value: object) -> str:

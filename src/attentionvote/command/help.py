@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, get_origin
 
 from omegaconf import OmegaConf
 
@@ -12,7 +14,8 @@ from attentionvote.command.conf_folder import choices, primary_groups
 from attentionvote.command.configuration import VerbSettings, compose, leaves
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.section import find
-from attentionvote.setting import Setting
+from attentionvote.section import leaves as fields_below
+from attentionvote.setting import Field, wanted, without_null
 
 
 def help_text(settings: type[VerbSettings], conf: Path) -> str:
@@ -34,15 +37,29 @@ def help_text(settings: type[VerbSettings], conf: Path) -> str:
         assert isinstance(primary, dict)
         composed = {str(key): value for key, value in primary.items() if key not in ("defaults", "hydra")}
     lines += ["", "Settings (key=value) and their defaults:"]
+    shown = ""  # the dict whose meaning stands above its first key
     for key, value in leaves(composed):
         lines.append(f"  {key}={json.dumps(value, ensure_ascii=False)}")
-        field = find(settings, key, composed)
-        if field is not None and (text := _meaning(field.setting)):
-            lines.append(f"      {text}")
+        above, field = key.rpartition(".")[0], find(settings, key, composed)
+        if field is not None and not (shown and above == shown):
+            lines += _meaning(field)
+        holder = find(settings, above, composed) if above else None
+        shown = above if holder is not None and get_origin(holder.type) in (dict, Mapping) else ""
+    known = dict(leaves(composed))
+    more = [(key, f) for key, f in fields_below(settings) if f.default is not ... and not _stands(key, known)]
+    if more:
+        lines += ["", "Settings that conf/ leaves out (+key=value):"]
+        for key, field in more:
+            lines += [f"  +{key}={json.dumps(field.default, ensure_ascii=False, default=str)}", *_meaning(field)]
     return "\n".join([*lines, "", "A comma-separated list of values with -m runs a grid (Hydra's multirun)."])
 
 
-def _meaning(setting: Setting) -> str:
-    """What a setting means and may be, on one line."""
-    allowed = setting.range_text()
-    return f"{setting.help} [{allowed}]" if allowed and setting.help else setting.help or allowed
+def _stands(key: str, known: Mapping[str, Any]) -> bool:
+    """Whether a setting, its section or what lies in it is composed."""
+    return any(f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.") for name in known)
+
+
+def _meaning(field: Field) -> list[str]:
+    """What a setting means and may be: a line, or none."""
+    allowed = wanted(without_null(field.type)[0], field.setting, True) if field.setting.help else ""
+    return [f"      {field.setting.help}" + (f" [{allowed}]" if allowed else "")] if field.setting.help else []

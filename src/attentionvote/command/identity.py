@@ -11,6 +11,7 @@ NOT_IDENTITY = (
     *("resume", "force", "workers", "executor", "cluster", "tracking", "outputs", "root"),
     *("data.workers", "trainer.threads"),
 )
+NETWORK = "attentionvote.model.AttentionVote"  # the class that conf/model named before 0.2
 
 
 def without(composed: Mapping[str, Any], keys: tuple[str, ...] = NOT_IDENTITY) -> dict[str, Any]:
@@ -19,6 +20,6 @@ def without(composed: Mapping[str, Any], keys: tuple[str, ...] = NOT_IDENTITY) -
     for key in keys:
         section, _, leaf = key.rpartition(".")
         (plain.get(section, {}) if section else plain).pop(leaf, None)
-    if "model" in plain:  # conf/model named its class before 0.2: a training keeps its identity
-        plain["model"]["_target_"] = "attentionvote.model.AttentionVote"
+    if "model" in plain:  # a training keeps its identity
+        plain["model"]["_target_"] = NETWORK
     return plain

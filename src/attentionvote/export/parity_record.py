@@ -29,7 +29,7 @@ class Limits:
     confidence_p99: Annotated[float, Setting("99th percentile of all matched pairs.", low=0, high=1)]
     unmatched: Annotated[int, Setting("Detections without a partner, both sides together.", low=0, high=1_000_000)]
     ap: Annotated[float, Setting("Average precision at 10, 5 and 2 % of D.", low=0, high=1)]
-    scenes: Annotated[int, Setting("Least number of scenes for a proof.", low=1, high=100_000)]
+    scenes: Annotated[int, Setting("Least number of scenes for a proof.", low=0, high=100_000)]
 
     def __post_init__(self) -> None:
         check(self)

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from attentionvote.section import check
-from attentionvote.setting import ChoicesOf, Setting
+from attentionvote.setting import ChoicesOf, Setting, SettingError
 
 _FUSIONS = ChoicesOf("attentionvote.model.fusion", "FUSIONS", ("aml", "amx", "pn"))
 Widths = tuple[int, ...]
+LEVELS = 4  # set abstractions of the backbone, with radii r, 2r, 3r and 6r
 
 
 @dataclass(frozen=True)
@@ -91,3 +92,11 @@ class NetworkSettings:
 
     def __post_init__(self) -> None:
         check(self)
+        for name in ("centers", "neighbors", "widths"):
+            if len(getattr(self, name)) != LEVELS:
+                raise SettingError(f"{name} must have {LEVELS} entries, one a level; got {list(getattr(self, name))}")
+        for name in ("propagation", "fusion", "head"):
+            if not getattr(self, name):
+                raise SettingError(f"{name} must have at least one width; got []")
+        if not all(self.widths):
+            raise SettingError(f"widths must have at least one width a level; got {[list(w) for w in self.widths]}")

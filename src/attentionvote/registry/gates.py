@@ -28,7 +28,7 @@ class Rules:
         SettingError: when a value is out of its range.
     """
 
-    scenes: Annotated[int, Setting("Least size of the evaluation set.", low=1, high=1_000_000)]
+    scenes: Annotated[int, Setting("Least size of the evaluation set.", low=0, high=1_000_000)]
     floors: Annotated[
         Mapping[str, float | None], Setting("Least values by figure, whatever the champion reaches.", low=0, high=1)
     ]

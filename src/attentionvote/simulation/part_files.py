@@ -32,7 +32,7 @@ def load_part(
         units: unit of the file's numbers (m, cm, mm, inch).
         symmetry: proper symmetry in the part frame; left out, the built-in's, or none.
         title: one line for people.
-        base_radius: override of a scale setting in metres; read by the pipelines, not used here.
+        base_radius: override of a scale setting in metres; conf/model takes it from here, not used by the part.
         voxel_size: the same for the voxel size.
 
     Raises:
@@ -40,8 +40,8 @@ def load_part(
         FileNotFoundError: when the mesh file is missing; the sentence says where it comes from.
     """
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size), ("diameter", diameter)):
-        if value is not None and not 0 < value < 10:
-            raise ValueError(f"{name}: {key} must be positive metres (below 10) or null, got {value}")
+        if value is not None and not 0 < value <= 10:
+            raise ValueError(f"{name}: {key} must be positive metres (at most 10) or null, got {value}")
     from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
     from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
 
@@ -87,8 +87,8 @@ def load_parts(
         listed = ", ".join(map(str, parts)) if isinstance(parts, Mapping) else repr(parts)
         raise ValueError(f"{name}: parts must be at least two parts by name, got {listed or 'none'}")
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size)):
-        if value is not None and not 0 < value < 10:
-            raise ValueError(f"{name}: {key} must be positive metres (below 10) or null, got {value}")
+        if value is not None and not 0 < value <= 10:
+            raise ValueError(f"{name}: {key} must be positive metres (at most 10) or null, got {value}")
     return PartSet(name, tuple(_member(name, key, settings) for key, settings in parts.items()), title)
 
 

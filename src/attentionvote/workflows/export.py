@@ -90,7 +90,7 @@ class ExportJob:
         return Path(self.cfg.outputs) / self.part.name
 
     def locked(self) -> AbstractContextManager[None]:
-        """Be the only process that writes bundles of this part; ConfigurationError when another one does."""
+        """Be the only process that writes bundles of this part; FolderUnavailable when another one does."""
         return locked_folder(self.folder, self.cfg.outputs, "part's export")
 
     def done(self) -> dict[str, Any] | None:
@@ -166,7 +166,7 @@ class ExportJob:
 
         code = hashlib.sha256()
         package = Path(attentionvote.__file__).parent
-        for path in sorted([*package.rglob("*.py"), *package.rglob("*.c")]):
+        for path in sorted(p for p in package.rglob("*") if p.suffix in (".py", ".c") and _decides(p, package)):
             code.update(path.read_bytes())
         weights = hashlib.sha256((self.training / MODEL).read_bytes()).hexdigest()
         content = {
@@ -232,6 +232,13 @@ class ExportWork:
         first = [self.indices[i] for i in held_out.spread(len(self.indices), self.job.cfg.golden)]
         order = dict.fromkeys([*first, *self.indices])
         yield from held_out.whole_clouds(self.scenes, self.job.part, self.settings, order)
+
+
+def _decides(path: Path, package: Path) -> bool:
+    """Whether a file of the package has a say in what is exported; other verbs, tables and pictures have none."""
+    room, *rest = path.relative_to(package).parts
+    others = ("command", "drawing", "measurement", "registry", "tracking", "workflows")
+    return room not in others or rest == ["export.py"]
 
 
 def _described(training: Path, result: dict[str, Any]) -> str:

@@ -71,7 +71,7 @@ class TrainingJob:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def locked(self) -> AbstractContextManager[None]:
-        """Be the only process of this training; ConfigurationError when another one is at it."""
+        """Be the only process of this training; FolderUnavailable when another one is at it."""
         return locked_folder(self.directory, str(self.directory.parents[1]), "training")
 
 

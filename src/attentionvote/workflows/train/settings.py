@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 from attentionvote.command.configuration import VerbSettings
+from attentionvote.command.identity import NETWORK
 from attentionvote.command.sections import EXECUTOR, SEED, Cluster, Tracking
 from attentionvote.data.settings import DataSettings
 from attentionvote.model.settings import NetworkSettings
 from attentionvote.section import Target
-from attentionvote.setting import Setting
+from attentionvote.setting import Setting, SettingError
 from attentionvote.simulation.scene_spec import SimulationSettings
 from attentionvote.training.settings import Loss, TrainerSettings
 
@@ -40,3 +42,17 @@ class TrainSettings(VerbSettings):
     ]
     executor: Annotated[str, EXECUTOR]
     tracking: Tracking
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> Self:
+        """Settings of plain containers; the class that files of conf/model named before 0.2 may stand there.
+
+        Raises:
+            SettingError: as ``VerbSettings.of``.
+        """
+        model = plain.get("model")
+        if isinstance(model, Mapping) and "_target_" in model:
+            if model["_target_"] != NETWORK:
+                raise SettingError(f"model._target_ must be left out or {NETWORK}; got {model['_target_']!r}")
+            plain = {**plain, "model": {name: value for name, value in model.items() if name != "_target_"}}
+        return super().of(plain)
