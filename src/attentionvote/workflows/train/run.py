@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheck
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from attentionvote import __version__
+from attentionvote.command.executors import executor_of
 from attentionvote.data.clouds import Clouds
 from attentionvote.data.datamodule import PartDataModule
 from attentionvote.data.sensing import CloudSettings
@@ -102,7 +103,9 @@ class TrainingRun:
         self._introduce()
         if not self.process.rank:
             connect(resolve_store(self.cfg.tracking.store))  # said before the scenes are made, not after
-        clouds, digests = prepare_data(self.cfg, self.job, self.clouds, self.workers, self.process, self.first_does)
+        clouds, digests = prepare_data(
+            self.job, self.clouds, self.cfg.root, executor_of(self.cfg), self.workers, self.process, self.first_does
+        )
         self.module.metadata["data"] |= digests
         if self.job.dataset is not None:
             self.module.metadata["data"] |= self.job.dataset.evidence
@@ -114,7 +117,9 @@ class TrainingRun:
                 self._fit(data, None)
                 self._detect(data)
                 return None
-            with open_tracking(self.cfg, self.job, self.module, self.process.processes) as tracked:
+            with open_tracking(
+                self.job, self.module, self._choices(), self.process.processes, self.cfg.tracking, self.cfg.yaml()
+            ) as tracked:
                 progress = self._fit(data, tracked)
                 losses = log_losses(tracked)
                 weights, detections = self._detect(data)
@@ -142,6 +147,22 @@ class TrainingRun:
             "/".join(f"{assessed['metrics'][f'ap_{k}']:.3f}" for k in (10, 5, 2)),
         )
         return result
+
+    def _choices(self) -> dict[str, object]:
+        """What tells trainings apart at a glance: parameters of the run."""
+        cfg = self.cfg
+        choices: dict[str, object] = {
+            "object": self.part.name,
+            "diameter": self.part.diameter,
+            "seed": cfg.seed,
+            "points": cfg.data.points,
+            "parameters": sum(p.numel() for p in self.module.model.parameters()),
+            "train_scenes": self.job.scene_counts["train"],
+            "epochs": cfg.trainer.max_epochs,
+            "batch_size": cfg.trainer.batch_size,
+            "learning_rate": cfg.trainer.learning_rate,
+        }
+        return choices if self.job.dataset is None else choices | {"dataset": str(self.job.dataset)}
 
     @property
     def _checkpoints(self) -> Path:

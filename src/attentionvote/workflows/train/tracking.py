@@ -6,50 +6,46 @@ import json
 import logging
 from typing import Any
 
+from attentionvote.command.sections import Tracking
 from attentionvote.files import write_json
 from attentionvote.tracking.run import Run
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.training.module import PoseTraining
 from attentionvote.workflows.train.job import RUN, TrainingJob
-from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
 DATASET = "dataset.json"
 
 
-def open_tracking(cfg: TrainSettings, job: TrainingJob, module: PoseTraining, processes: int) -> Run:
+def open_tracking(
+    job: TrainingJob,
+    module: PoseTraining,
+    choices: dict[str, object],
+    processes: int,
+    tracking: Tracking,
+    config_yaml: str,
+) -> Run:
     """The run of a training, the one it began with where the store still has it.
 
     Args:
-        cfg: of the training.
         job: whose folder keeps the run's id.
         module: with the digests of the scenes in its metadata.
+        choices: parameters of the run.
         processes: that share the training.
+        tracking: where and how it is tracked.
+        config_yaml: the settings whole.
     """
-    part, counts = job.part, job.scene_counts
-    choices: dict[str, object] = {
-        "object": part.name,
-        "diameter": part.diameter,
-        "seed": cfg.seed,
-        "points": cfg.data.points,
-        "parameters": sum(p.numel() for p in module.model.parameters()),
-        "train_scenes": counts["train"],
-        "epochs": cfg.trainer.max_epochs,
-        "batch_size": cfg.trainer.batch_size,
-        "learning_rate": cfg.trainer.learning_rate,
-    }
-    if job.dataset is not None:
-        choices["dataset"] = str(job.dataset)
+    part = job.part
     settings: dict[str, Any] = {
-        "store": cfg.tracking.store,
+        "store": tracking.store,
         "experiment": part.name,
         "name": f"{part.name}-{job.directory.name}",
         "params": choices,
         "tags": {"processes": processes},
-        "config_yaml": cfg.yaml(),
-        "datasets": {split: module.metadata["data"][split] for split in counts},
-        "system_interval_s": cfg.tracking.system_interval,
-        "parent": cfg.tracking.parent,
+        "config_yaml": config_yaml,
+        "datasets": {split: module.metadata["data"][split] for split in job.scene_counts},
+        "system_interval_s": tracking.system_interval,
+        "parent": tracking.parent,
     }
     run_id = job.run_id
     try:
