@@ -178,7 +178,7 @@ def test_a_study_that_has_its_total_is_reported_without_a_worker(words: list[str
         ("executor=rya", "executor must be one of local, ray, slurm; got 'rya', did you mean 'ray'?"),
         ("save_as=a/b", "save_as must be a name of letters, digits, - and _, got 'a/b'"),
         ("storage=nonsense", "storage must be the SQLAlchemy URI of a database that answers.*got nonsense"),
-        ("~model.merge_fraction", "takes no word that deletes a setting"),
+        ("~model.merge_fraction", "model.merge_fraction can be changed, not taken away"),
         ("~trainer.log_every_steps", "trainer.log_every_steps must be given"),
     ],
 )
