@@ -24,8 +24,8 @@ settings.load_profile("project")
 
 # Fixtures that several folders of tests share, and how the tests are distributed.
 pytest_plugins = [
-    "bop_split", "box_scenes", "brick_models", "databases", "distribution", "one_piece_parts", "quick_training",
-    "real_servers", "tiny_bundle", "work_trees",
+    "bop_split", "box_scenes", "brick_models", "databases", "distribution", "environment", "one_piece_parts",
+    "quick_training", "real_servers", "tiny_bundle", "work_trees",
 ]  # fmt: skip
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT / ".." / "shared" / "data"

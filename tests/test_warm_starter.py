@@ -31,6 +31,17 @@ print("read", sys.stdin.read(), file=sys.stderr)
 pytestmark = pytest.mark.slow  # the starter imports for half a minute on a busy machine
 
 
+@pytest.fixture(autouse=True)
+def environment_of_the_starter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ours is, whatever was set since it was started."""
+    started = warm_starter.STARTER.environment
+    for name in os.environ.keys() | started.keys():
+        if name in started:
+            monkeypatch.setenv(name, started[name])
+        else:
+            monkeypatch.delenv(name)
+
+
 @pytest.fixture
 def script(tmp_path: Path) -> None:
     (tmp_path / "tell.py").write_text(TELL, encoding="utf-8")
@@ -151,7 +162,7 @@ def begun() -> Iterator[list[warm_starter.Popen]]:
 def test_what_a_fork_would_not_be_is_a_real_start(
     begun: list[warm_starter.Popen], changes: dict[str, str], settings: dict[str, Any], warm: bool
 ) -> None:
-    settings = {"env": {**os.environ, **changes}, **settings}  # as it is now: other tests have set variables
+    settings = {"env": {**os.environ, **changes}, **settings}
     process = warm_starter.Popen([sys.executable, "-c", "import time; time.sleep(100)"], **settings)
     begun.append(process)
     assert process.warm == warm

@@ -11,14 +11,14 @@ import pytest
 from attentionvote.execution import Executor, LocalPool, RayCluster, SlurmArray
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def ray_cluster() -> Iterator[RayCluster]:
-    """A cluster of two cores, started once; its token is in the environment, so that none is written at home."""
+    """A cluster of two cores, started once; its token was in the environment, so that none is written at home."""
+    import ray
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_TOKEN", uuid.uuid4().hex)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        import ray
-
         ray.init(
             address="local",
             num_cpus=2,
@@ -27,10 +27,10 @@ def ray_cluster() -> Iterator[RayCluster]:
             logging_level="error",
             object_store_memory=128 * 2**20,
         )
-        try:
-            yield RayCluster()
-        finally:
-            ray.shutdown()
+    try:
+        yield RayCluster()
+    finally:
+        ray.shutdown()
 
 
 @pytest.fixture(params=["local", "slurm", "ray"])

@@ -7,10 +7,12 @@ import json
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +90,34 @@ def does(tmp_path: Path) -> Callable[[dict[int, str]], None]:
 
 
 Does = Callable[[dict[int, str]], None]
+StartSweep = Callable[[int], "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start_sweep(tmp_path: Path) -> Iterator[StartSweep]:
+    """Starts a sweep of so many trials, two at a time, in a process that ends with the test."""
+    with ExitStack() as stack:
+
+        def start(trials: int) -> subprocess.Popen[str]:
+            words = [sys.executable, "-c", SWEEP, str(tmp_path), str(trials), "2"]
+            process = stack.enter_context(subprocess.Popen(words, text=True, stderr=subprocess.PIPE))
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+def pause(process: subprocess.Popen[str], folder: Path) -> None:
+    """Stop a sweep, but not while it writes: nobody else could, before it goes on."""
+    for _ in range(100):
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        with closing(sqlite3.connect(folder / "study.db", timeout=0)) as study, suppress(sqlite3.OperationalError):
+            study.execute("BEGIN IMMEDIATE")
+            return
+        process.send_signal(signal.SIGCONT)
+        time.sleep(0.01)
+    raise AssertionError("the sweep writes all the time")
 
 
 def notes(folder: Path) -> list[list[str]]:
@@ -177,14 +207,16 @@ def test_two_at_a_time_and_never_two_at_one_training(tmp_path: Path, does: Does)
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_it_goes_on_as_if_it_had_not_been(tmp_path: Path, does: Does) -> None:
+def test_killed_in_the_middle_it_goes_on_as_if_it_had_not_been(
+    tmp_path: Path, does: Does, start_sweep: StartSweep
+) -> None:
     whole = tmp_path / "whole"
     whole.mkdir()
     (whole / "does.json").write_text("{}")
     ledger, sweep = driver(whole)
     sweep.run(4, lambda: None)
     does({1: "wait", 2: "wait"})
-    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "4", "2"], text=True, stderr=-1)
+    process = start_sweep(4)
     until(lambda: {"1", "2"} <= {note[1] for note in notes(tmp_path)}, process)
     process.kill()
     process.communicate()
@@ -202,9 +234,9 @@ def test_killed_in_the_middle_it_goes_on_as_if_it_had_not_been(tmp_path: Path, d
         assert str(tmp_path) not in command_line_of(note[2])
 
 
-def test_ctrl_c_ends_the_trials_orderly_and_they_go_on(tmp_path: Path, does: Does) -> None:
+def test_ctrl_c_ends_the_trials_orderly_and_they_go_on(tmp_path: Path, does: Does, start_sweep: StartSweep) -> None:
     does({0: "wait", 1: "wait"})
-    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "3", "2"], text=True, stderr=-1)
+    process = start_sweep(3)
     until(lambda: len(notes(tmp_path)) == 2, process)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
@@ -218,11 +250,13 @@ def test_ctrl_c_ends_the_trials_orderly_and_they_go_on(tmp_path: Path, does: Doe
     assert len(list((tmp_path / "logs").iterdir())) == 3
 
 
-def test_paused_for_too_long_it_leaves_its_trials_to_the_sweep_that_took_them_over(tmp_path: Path, does: Does) -> None:
+def test_paused_for_too_long_it_leaves_its_trials_to_the_sweep_that_took_them_over(
+    tmp_path: Path, does: Does, start_sweep: StartSweep
+) -> None:
     does({0: "wait", 1: "wait"})
-    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "2", "2"], text=True, stderr=-1)
+    process = start_sweep(2)
     until(lambda: len(notes(tmp_path)) == 2, process)
-    process.send_signal(signal.SIGSTOP)
+    pause(process, tmp_path)
     # Awake again, it would find this trial crashed and take it up.
     os.kill(int(next(note[2] for note in notes(tmp_path) if note[1] == "1")), signal.SIGKILL)
     does({})
@@ -251,11 +285,11 @@ def test_paused_for_too_long_it_leaves_its_trials_to_the_sweep_that_took_them_ov
     assert states(ledger) == ["COMPLETE"] * 3
 
 
-def test_a_short_pause_changes_nothing(tmp_path: Path, does: Does) -> None:
+def test_a_short_pause_changes_nothing(tmp_path: Path, does: Does, start_sweep: StartSweep) -> None:
     does({})
-    process = subprocess.Popen([sys.executable, "-c", SWEEP, str(tmp_path), "2", "2"], text=True, stderr=-1)
+    process = start_sweep(2)
     until(lambda: len(notes(tmp_path)) > 1, process)
-    process.send_signal(signal.SIGSTOP)
+    pause(process, tmp_path)
     ledger = driver(tmp_path, place="elsewhere", heartbeat_s=1)[0]
     with pytest.raises(ValueError, match="must have one sweep at a time"):
         ledger.lost()
