@@ -138,7 +138,7 @@ def bomb_bodies() -> dict[str, bytes]:
         "bzip2": _packed(zipfile.ZIP_BZIP2, 40_000_000),
         "deflated": _packed(zipfile.ZIP_DEFLATED, 400_000_000),
         "two headers": _png_with_two_headers(),
-        "literals": _pcd_of_literals(2_000_000),
+        "literals": _pcd_of_literals(500_000),
     }
 
 

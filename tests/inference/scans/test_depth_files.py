@@ -18,6 +18,7 @@ from PIL import Image
 
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scans.depth_files import CameraIntrinsics, read_depth
+from attentionvote.inference.scans.limits import Budget
 
 MIB = 1024 * 1024
 
@@ -173,7 +174,7 @@ def test_chunks_that_are_no_pixels_are_not_looked_at() -> None:
 def test_more_chunks_than_any_writer_makes_are_refused() -> None:
     whole = png(IMAGE)
     with pytest.raises(InputError, match="must have at most 65536 chunks, got more: write it again"):
-        read_depth(whole[:33] + chunk(b"IDAT", b"") * 65_536 + whole[33:])
+        read_depth(whole[:33] + chunk(b"IDAT", b"") * 65_536 + whole[33:], budget=Budget(most_seconds=30.0))
     with pytest.raises(InputError, match="cannot be decoded: it is truncated or damaged"):
         read_depth(whole[:33] + struct.pack(">I", 2**32 - 1) + b"tEXt" + whole[33:])
 
