@@ -112,10 +112,13 @@ def test_nan_confidence_and_zero_quaternions_are_left_out(make_card: MakeCard) -
 
 
 DETECTION = Detection(transform(rotation_about([0, 0, 1], np.pi / 2), [0.1, 0.2, 0.8]), 0.9, "bracket", 5.0)
+FACTS: dict[str, Any] = {
+    "part": "bracket", "model": "abc", "points_given": 100, "points_measured": 95, "points_used": 90,
+}  # fmt: skip
 
 
 def test_an_estimate_is_plain_data() -> None:
-    answer = Estimate((DETECTION,), "bracket", "abc", 100, 95, 90, {"total": 0.5}, ("a warning",))
+    answer = Estimate(detections=(DETECTION,), **FACTS, seconds={"total": 0.5}, warnings=("a warning",))
     said = json.loads(json.dumps(answer.to_dict(), allow_nan=False))
     pose = said.pop("poses")[0]
     assert said == {
@@ -137,8 +140,8 @@ def test_an_estimate_is_plain_data() -> None:
 
 
 def test_an_abstention_has_the_same_fields_and_no_poses() -> None:
-    estimate = Estimate((DETECTION,), "bracket", "abc", 100, 95, 90)
-    abstention = Abstention("too_few_points", "why", "bracket", "abc", 100, 95, 90)
+    estimate = Estimate(detections=(DETECTION,), **FACTS)
+    abstention = Abstention(reason="too_few_points", message="why", **FACTS)
     said = abstention.to_dict()
     assert set(said) == set(estimate.to_dict()) | {"reason", "message"}
     assert (said["answer"], said["reason"], said["message"], said["poses"]) == (

@@ -18,55 +18,21 @@ if TYPE_CHECKING:
     from attentionvote.inference.scans.cloud_files import read_cloud
     from attentionvote.inference.scans.depth_files import CameraIntrinsics, read_depth
 
-_MODULE_OF = {
-    "Abstention": "answer",
-    "Bundle": "bundles.bundle",
-    "BundleError": "errors",
-    "CameraIntrinsics": "scans.depth_files",
-    "Cell": "cell",
-    "Crop": "crop",
-    "DeadlineExceeded": "errors",
-    "Detection": "answer",
-    "Estimate": "answer",
-    "GoldenCloud": "bundles.bundle",
-    "InputError": "errors",
-    "PoseEstimator": "estimator",
-    "keys_folder": "bundles.signature",
-    "load_bundle": "bundles.bundle",
-    "load_private_key": "bundles.signature",
-    "load_public_key": "bundles.signature",
-    "make_keys": "bundles.signature",
-    "read_cell": "cell",
-    "read_cloud": "scans.cloud_files",
-    "read_depth": "scans.depth_files",
-    "self_test": "golden",
-    "write_manifest": "bundles.bundle",
+_NAMES = {
+    "answer": ("Abstention", "Detection", "Estimate"),
+    "bundles.bundle": ("Bundle", "GoldenCloud", "load_bundle", "write_manifest"),
+    "bundles.signature": ("keys_folder", "load_private_key", "load_public_key", "make_keys"),
+    "cell": ("Cell", "read_cell"),
+    "crop": ("Crop",),
+    "errors": ("BundleError", "DeadlineExceeded", "InputError"),
+    "estimator": ("PoseEstimator",),
+    "golden": ("self_test",),
+    "scans.cloud_files": ("read_cloud",),
+    "scans.depth_files": ("CameraIntrinsics", "read_depth"),
 }
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
-__all__ = [
-    "Abstention",
-    "Bundle",
-    "BundleError",
-    "CameraIntrinsics",
-    "Cell",
-    "Crop",
-    "DeadlineExceeded",
-    "Detection",
-    "Estimate",
-    "GoldenCloud",
-    "InputError",
-    "PoseEstimator",
-    "keys_folder",
-    "load_bundle",
-    "load_private_key",
-    "load_public_key",
-    "make_keys",
-    "read_cell",
-    "read_cloud",
-    "read_depth",
-    "self_test",
-    "write_manifest",
-]
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:

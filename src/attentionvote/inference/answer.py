@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -49,12 +49,11 @@ class Detection(NamedTuple):
         }
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Parts were found.
+@dataclass(frozen=True, kw_only=True)
+class _Facts:
+    """What both kinds of answer say.
 
     Attributes:
-        detections: most confident first, at least one.
         part: what was looked for.
         model: the first digits of the bundle's digest.
         points_given: places of the cloud or pixels of the image, missing measurements included.
@@ -65,7 +64,6 @@ class Estimate:
         poses_withheld: how many poses were left out because they could not be where the scan was measured.
     """
 
-    detections: tuple[Detection, ...]
     part: str
     model: str
     points_given: int
@@ -75,51 +73,43 @@ class Estimate:
     warnings: tuple[str, ...] = ()
     poses_withheld: int = 0
 
+    def _plain(self) -> dict[str, Any]:
+        """These as plain data, and what the poses mean."""
+        facts: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(_Facts)}
+        facts |= {"seconds": dict(self.seconds), "warnings": list(self.warnings)}
+        return {"frame": FRAME, "units": UNITS, **facts}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate(_Facts):
+    """Parts were found.
+
+    Attributes:
+        detections: most confident first, at least one; the others are those of every answer.
+    """
+
+    detections: tuple[Detection, ...]
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON, with the list ``poses``."""
-        return {"answer": "estimate", "poses": [d.to_dict() for d in self.detections], **_facts(self)}
+        return {"answer": "estimate", "poses": [d.to_dict() for d in self.detections], **self._plain()}
 
 
-@dataclass(frozen=True)
-class Abstention:
+@dataclass(frozen=True, kw_only=True)
+class Abstention(_Facts):
     """No pose is answered, and why.
 
     Attributes:
         reason: one of ``REASONS``.
-        message: the reason in a sentence.
-        part, model, points_given, points_measured, points_used, seconds, warnings, poses_withheld: as in ``Estimate``.
+        message: the reason in a sentence; the others are those of every answer.
     """
 
     reason: Reason
     message: str
-    part: str
-    model: str
-    points_given: int
-    points_measured: int
-    points_used: int
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    poses_withheld: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON; ``poses`` is there and empty."""
-        return {"answer": "abstention", "reason": self.reason, "message": self.message, "poses": [], **_facts(self)}
-
-
-def _facts(answer: Estimate | Abstention) -> dict[str, Any]:
-    """What both kinds of answer say."""
-    return {
-        "frame": FRAME,
-        "units": UNITS,
-        "part": answer.part,
-        "model": answer.model,
-        "points_given": answer.points_given,
-        "points_measured": answer.points_measured,
-        "points_used": answer.points_used,
-        "seconds": dict(answer.seconds),
-        "warnings": list(answer.warnings),
-        "poses_withheld": answer.poses_withheld,
-    }
+        return {"answer": "abstention", "reason": self.reason, "message": self.message, "poses": [], **self._plain()}
 
 
 def detections_from(outputs: Mapping[str, NDArray[np.float32]], card: ModelCard) -> tuple[tuple[Detection, ...], int]:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Collection
 from dataclasses import MISSING, dataclass, fields
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.inference.crop import Crop
-from attentionvote.inference.errors import InputError
+from attentionvote.inference.errors import InputError, nearest
 from attentionvote.inference.scans.depth_files import CameraIntrinsics
 from attentionvote.inference.scans.limits import BLOCK_ROWS
 
@@ -43,10 +42,9 @@ class CloudUnit:
 
     def __post_init__(self) -> None:
         if not isinstance(self.unit, str) or self.unit not in _UNITS_A_METRE:
-            near = difflib.get_close_matches(str(self.unit).lower(), _UNITS_A_METRE, n=1, cutoff=0.0)[0]
+            hint = nearest(str(self.unit).lower(), _UNITS_A_METRE, cutoff=0.0)
             raise InputError(
-                f"cloud unit must be one of {', '.join(_UNITS_A_METRE)}, got {str(self.unit)[:20]!r}, "
-                f"did you mean {near!r}?"
+                f"cloud unit must be one of {', '.join(_UNITS_A_METRE)}, got {str(self.unit)[:20]!r}{hint}"
             )
 
     def metres(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -154,10 +152,8 @@ def _check_keys(what: str, value: Any, possible: Collection[str], needed: Collec
         raise InputError(f"{what} must be a JSON object with {', '.join(possible)}, got {type(value).__name__}")
     for key in value:
         if key not in possible:
-            near = difflib.get_close_matches(key, possible, n=1, cutoff=0.0)[0]
-            raise InputError(
-                f"{what} must have the keys {', '.join(possible)}; got {key[:60]!r}, did you mean {near!r}?"
-            )
+            hint = nearest(key, possible, cutoff=0.0)
+            raise InputError(f"{what} must have the keys {', '.join(possible)}; got {key[:60]!r}{hint}")
     for key in needed:
         if key not in value:
             raise InputError(f"{what} must have {key}, but it is missing")

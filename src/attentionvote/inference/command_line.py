@@ -12,6 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -23,6 +24,13 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 BUNDLE_VARIABLE = "ATTENTIONVOTE_BUNDLE"
+# Verbs that lie in a module of their own, which is loaded only for them: name, module, help and description.
+_ELSEWHERE = (
+    ("serve", "server.serve", "the cell's HTTP server", "Serve a bundle over HTTP."),
+    ("health", "server.health", "is a server ready? exit code 0 or 1", "Ask a server."),
+    ("fetch", "fetching.command", "fetch a bundle from a registry", "Fetch a bundle, verify it."),
+    ("docs", "documentation", "the operator's pages", "List the pages, or print one."),
+)
 # For one file: whoever types a command waits for it, and nobody else does.
 _MOST_READING_S = 60.0
 
@@ -77,7 +85,7 @@ def _say(message: object) -> None:
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser; the server's options are looked up only where they are asked for."""
+    """The parser; the options of verbs that lie elsewhere are looked up only where they are asked for."""
     parser = _Parser(prog="attentionvote", description="6D poses of parts in a bin, from a signed model bundle.")
     parser.add_argument("--version", action=_Version, nargs=0, help="say the version and end")
     verbs = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
@@ -99,33 +107,12 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     verb.add_argument("--self-test", action="store_true", help="also estimate its golden clouds, as a cell does")
     verb.set_defaults(run=_verify_bundle)
 
-    verb = verbs.add_parser("serve", help="the cell's HTTP server", description="Serve a bundle over HTTP.")
-    if words[:1] == ["serve"]:
-        from attentionvote.inference.server import serve
-
-        serve.add_arguments(verb)
-        verb.set_defaults(run=serve.run)
-
-    verb = verbs.add_parser("health", help="is a server ready? exit code 0 or 1", description="Ask a server.")
-    if words[:1] == ["health"]:
-        from attentionvote.inference.server import health
-
-        health.add_arguments(verb)
-        verb.set_defaults(run=health.run)
-
-    verb = verbs.add_parser("fetch", help="fetch a bundle from a registry", description="Fetch a bundle, verify it.")
-    if words[:1] == ["fetch"]:
-        from attentionvote.inference.fetching import command as fetch_command
-
-        fetch_command.add_arguments(verb)
-        verb.set_defaults(run=fetch_command.run)
-
-    verb = verbs.add_parser("docs", help="the operator's pages", description="List the pages, or print one.")
-    if words[:1] == ["docs"]:
-        from attentionvote.inference import documentation
-
-        documentation.add_arguments(verb)
-        verb.set_defaults(run=documentation.run)
+    for name, module, text, description in _ELSEWHERE:
+        verb = verbs.add_parser(name, help=text, description=description)
+        if words[:1] == [name]:
+            chosen = import_module(f"attentionvote.inference.{module}")
+            chosen.add_arguments(verb)
+            verb.set_defaults(run=chosen.run)
 
     verb = verbs.add_parser("keys", help="make the key pair that signs bundles", description=_keys.__doc__)
     verb.add_argument("--folder", metavar="PATH", help="default: $ATTENTIONVOTE_KEYS or ~/.config/attentionvote")

@@ -33,7 +33,7 @@ class RegistryError(BundleError):
         self.away = away
 
 
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """``, did you mean 'x'?`` when one of the valid names is close, else nothing."""
-    near = difflib.get_close_matches(name[:_LONGEST_NAME], list(valid), n=1, cutoff=0.5)
+def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str:
+    """``, did you mean 'x'?`` when one of the valid names is close, else nothing; at a cutoff of 0 one always is."""
+    near = difflib.get_close_matches(name[:_LONGEST_NAME], list(valid), n=1, cutoff=cutoff)
     return f", did you mean {near[0]!r}?" if near else ""

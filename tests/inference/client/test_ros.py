@@ -86,8 +86,9 @@ def test_a_quarter_turn_about_z_by_hand() -> None:
 
 def test_an_abstention_has_no_detections() -> None:
     empty = Abstention(
-        "too_few_points", "0 points", part="gear", model="12ab", points_given=0, points_measured=0, points_used=0
-    )
+        reason="too_few_points", message="0 points", part="gear", model="12ab", points_given=0, points_measured=0,
+        points_used=0,
+    )  # fmt: skip
     content = detection_array(empty.to_dict(), BOX, "camera", 7)
     assert content["detections"] == []
     assert content["header"]["stamp"] == {"sec": 7, "nanosec": 0}

@@ -21,7 +21,6 @@ _MOST_FIELD_BYTES = 320  # of a number; as scan_bytes.c
 _MOST_UNDECIDED = 4096
 _STOP_BYTES = 4 * MIB
 _PIECE_BYTES = 64 * 1024
-_OTHER_WIDTH = 1
 _NOTHING = (-1, -1, -1)
 # Zeros pad some writers' files to whole blocks.
 _PADDING = b"\0 \t\r\n\v\f"
@@ -158,7 +157,7 @@ class _RowsByPython:
             values: list[tuple[float, ...]] = []
             for line in lines:
                 self.at += len(line)
-                if fields := _fields(line, layout.mark):
+                if fields := fields_of(line, layout.mark):
                     values.append(_numbers(fields, layout) if out is not None else ())
                     if done + len(values) == count:
                         break
@@ -183,8 +182,8 @@ class _RowsByPython:
             yield lines
 
 
-def _fields(line: bytes, mark: bytes) -> list[bytes]:
-    """Fields of a line; a mark may stand behind the last one."""
+def fields_of(line: bytes, mark: bytes) -> list[bytes]:
+    """Fields of a line, none of a blank one; a mark may stand behind the last one."""
     if not mark or not line.strip():
         return line.split()
     fields = [field.strip() for field in line.split(mark)]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from attentionvote.inference.scans.limits import Budget
 from attentionvote.inference.scans.missing_points import mark_missing
-from attentionvote.inference.scans.number_rows import RowLayout, all_number_rows
+from attentionvote.inference.scans.number_rows import RowLayout, all_number_rows, fields_of
 
 _MOST_HEAD_BYTES, _MOST_HEAD_LINES, _MOST_FIELDS = 64 * 1024, 256, 256
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -63,21 +63,14 @@ def points_from_text(content: memoryview, start: int, layout: RowLayout, budget:
 def _row_layout(line: bytes, header: bytes) -> RowLayout | None:
     """What a row of numbers looks like; None when the line is none."""
     mark = next((mark for mark in (b";", b",") if mark in line), b"")
-    fields = _fields(line, mark)
+    fields = fields_of(line, mark)
     mixed = b"," in line and (mark == b";" or any(b" " in field or b"\t" in field for field in fields))
     if mixed and _DECIMAL_COMMAS.fullmatch(line):
         raise ValueError("its numbers must have decimal points, got commas: write 0.5, not 0,5")
     if not 3 <= len(fields) <= _MOST_FIELDS:
         return None
-    columns = _columns(_fields(header, mark), len(fields))
+    columns = _columns(fields_of(header, mark), len(fields))
     return RowLayout(len(fields), columns, mark) if all(_NUMBER.fullmatch(fields[c]) for c in columns) else None
-
-
-def _fields(line: bytes, mark: bytes) -> list[bytes]:
-    if not mark:
-        return line.split()
-    fields = [field.strip() for field in line.split(mark)]
-    return fields if fields[-1] else fields[:-1]
 
 
 def _columns(names: list[bytes], width: int) -> list[int]:

@@ -89,11 +89,6 @@ class LastKnownGood:
             return sorted((p for p in self._copies.iterdir() if _NAME.fullmatch(p.name)), reverse=True)
         return []
 
-    def newest_digest(self) -> str | None:
-        """The first 12 digits of the newest copy's digest; None without copies."""
-        entries = self.entries()
-        return entries[0].name.partition("-")[2] if entries else None
-
     def keep(self, source: Path, bundle: Bundle, trusted: Trusted) -> None:
         """Make a bundle the newest copy and forget all but the two newest.
 

@@ -11,7 +11,6 @@ import mmap
 import os
 import socket
 from collections.abc import Iterable
-from types import TracebackType
 from typing import Any, NamedTuple
 
 _MOST_BYTES = 128 * 1024
@@ -68,9 +67,7 @@ class SharedContent:
     def __enter__(self) -> SharedContent:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
