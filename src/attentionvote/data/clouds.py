@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,24 +26,10 @@ from attentionvote.simulation.scene_set import SceneSet
 
 if TYPE_CHECKING:
     from attentionvote.data.dataset_split import DatasetSplit
+    from attentionvote.datasets import GroundTruth
+    from attentionvote.simulation.scene_record import SceneRecord
 
 _SCENES_PER_PROCESS = 24
-
-
-class Truth(Protocol):
-    """Where the parts of a scene are and how much of each is seen; see ``Scene``."""
-
-    @property
-    def camera_from_part(self) -> NDArray[np.float64]:
-        """``(I, 4, 4)``, metres."""
-
-    @property
-    def visible_fraction(self) -> NDArray[np.float64]:
-        """``(I,)`` in [0, 1]."""
-
-    @property
-    def part_ids(self) -> NDArray[np.int32]:
-        """``(I,)`` index of the part."""
 
 
 class Clouds:
@@ -56,7 +42,7 @@ class Clouds:
 
     def __init__(self, directory: Path, scenes: SceneSet | DatasetSplit) -> None:
         self.directory = directory
-        self.records: Sequence[Truth] = scenes.records
+        self.records: Sequence[SceneRecord | GroundTruth] = scenes.records
         self._arrays = open_arrays(directory, "r")
 
     def __len__(self) -> int:

@@ -20,7 +20,7 @@ from attentionvote.scene import Scene
 
 @dataclass(frozen=True)
 class DatasetScenes:
-    """The scored scenes of one object of a dataset: see ``registry.measurement.MeasuredScenes``.
+    """The scored scenes of one object of a dataset: see ``measurement.scenes.MeasuredScenes``.
 
     Args:
         dataset: with poses.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.part import Parts
@@ -12,26 +12,8 @@ from attentionvote.scene import Scene
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_set import SceneSet
 
-
-class MeasuredScenes(Protocol):
-    """Scenes to measure on: ours, generated, or those of somebody else's dataset."""
-
-    @property
-    def part(self) -> Parts:
-        """The part in them."""
-
-    @property
-    def digest(self) -> str:
-        """Same digest, same clouds."""
-
-    @property
-    def title(self) -> str:
-        """What saw them, for people."""
-
-    def __len__(self) -> int: ...
-
-    def clouds(self) -> Iterator[Scene]:
-        """Every scene as the sensor delivered it, without background."""
+if TYPE_CHECKING:
+    from attentionvote.measurement.dataset_scenes import DatasetScenes
 
 
 @dataclass(frozen=True)
@@ -61,3 +43,7 @@ class EvaluationSet:
         caster = PartCaster(self.part)
         for record in self.scenes.records:
             yield sense(record, caster, self.settings)[0]
+
+
+# Scenes to measure on: ours, generated, or those of somebody else's dataset.
+MeasuredScenes: TypeAlias = "EvaluationSet | DatasetScenes"

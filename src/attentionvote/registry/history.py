@@ -81,14 +81,7 @@ class History:
         Raises:
             ValueError: when an entry is none of ours.
         """
-        rows, token = [], None
-        while True:
-            page = self._versions.client.search_model_versions(f"name='{self.name}'", max_results=200, page_token=token)
-            rows += list(page)
-            token = page.token
-            if not token:
-                break
-        return sorted((_event(row) for row in rows), key=lambda event: event.number)
+        return sorted(map(_event, self._versions.rows(self.name)), key=lambda event: event.number)
 
     def append(
         self,
@@ -101,7 +94,8 @@ class History:
         facts: Mapping[str, str] | None = None,
     ) -> Event:
         """Add an event at the end; whether a move counts is known from ``counting`` afterwards."""
-        self._create()
+        about = f"Append-only story of {self._versions.name}: every version here is one decision, not a model"
+        self._versions.create(self.name, {"kind": "history"}, about)
         named = {f"fact.{name}": value[:_TEXT_LIMIT] for name, value in (facts or {}).items()}
         content = {"version": version, "before": before, "digest": digest, "base": base, "who": who(), "why": why}
         content["mark"] = uuid.uuid4().hex
@@ -116,16 +110,6 @@ class History:
     def mark_done(self, event: Event) -> None:
         """Note that the alias was moved."""
         self._versions.client.set_model_version_tag(self.name, str(event.number), _DONE, "yes")
-
-    def _create(self) -> None:
-        from mlflow.exceptions import MlflowException
-
-        about = f"Append-only story of {self._versions.name}: every version here is one decision, not a model"
-        try:
-            self._versions.client.create_registered_model(self.name, tags={"kind": "history"}, description=about)
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_ALREADY_EXISTS":
-                raise
 
 
 def counting(events: Sequence[Event]) -> list[Event]:

@@ -41,14 +41,12 @@ class Version:
         number: of the version.
         digest: of its bundle; empty when the version was not registered by us.
         run_id: of the training's run; empty when unknown.
-        created_s: when it was registered, seconds since 1970.
         tags: all of them.
     """
 
     number: int
     digest: str
     run_id: str
-    created_s: float
     tags: Mapping[str, str] = field(default_factory=dict, repr=False)
 
 
@@ -72,13 +70,18 @@ class Versions:
 
     def all(self) -> list[Version]:
         """Every version that exists, oldest first; empty when nothing was ever registered."""
-        listed, token = [], None
+        return sorted(map(_version, self.rows(self.name)), key=lambda version: version.number)
+
+    def rows(self, name: str) -> list[ModelVersion]:
+        """Every version of a registered model as the store has it, in no particular order."""
+        listed: list[ModelVersion] = []
+        token = None
         while True:
-            page = self.client.search_model_versions(f"name='{self.name}'", max_results=200, page_token=token)
-            listed += [_version(row) for row in page]
+            page = self.client.search_model_versions(f"name='{name}'", max_results=200, page_token=token)
+            listed += page
             token = page.token
             if not token:
-                return sorted(listed, key=lambda version: version.number)
+                return listed
 
     def champion(self) -> Version | None:
         """The version that cells follow; None before the first promotion, or when it was deleted."""
@@ -124,7 +127,10 @@ class Versions:
             with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
                 self._check(bundle.digest, model.artifact_location, Path(folder))
             self.client.finalize_logged_model(model.model_id, "READY")
-            self._create_registered_model()
+            about = (
+                f"6D pose models of {self.part}; moved by `make promote` and `make rollback`, see {self.name}-history"
+            )
+            self.create(self.name, {"part": self.part}, about)
             row = self.client.create_model_version(
                 self.name, f"models:/{model.model_id}", run_id=run_id, tags=facts, model_id=model.model_id
             )
@@ -188,12 +194,12 @@ class Versions:
         for name, value in tags.items():
             self.client.set_model_version_tag(self.name, str(version.number), name, value)
 
-    def _create_registered_model(self) -> None:
+    def create(self, name: str, tags: Mapping[str, str], about: str) -> None:
+        """Make a registered model, unless it is there."""
         from mlflow.exceptions import MlflowException
 
-        about = f"6D pose models of {self.part}; moved by `make promote` and `make rollback`, see {self.name}-history"
         try:
-            self.client.create_registered_model(self.name, tags={"part": self.part}, description=about)
+            self.client.create_registered_model(name, tags=dict(tags), description=about)
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
@@ -260,7 +266,7 @@ class Versions:
 
 def _version(row: ModelVersion) -> Version:
     tags = dict(row.tags)
-    return Version(int(row.version), tags.get(DIGEST_TAG, ""), row.run_id or "", row.creation_timestamp / 1000, tags)
+    return Version(int(row.version), tags.get(DIGEST_TAG, ""), row.run_id or "", tags)
 
 
 DATA_FACT = "data."  # and the split: digest of the scenes that a version was trained with, among its tags

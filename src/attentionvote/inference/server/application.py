@@ -22,7 +22,7 @@ from attentionvote.inference.server.access import Tokens
 from attentionvote.inference.server.answering import Answering
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Metrics
-from attentionvote.inference.server.model.reloading import Watch
+from attentionvote.inference.server.model.following import Watch
 from attentionvote.inference.server.protocol.answer import parts_of
 from attentionvote.inference.server.protocol.routes import ProtocolRoutes, registered
 from attentionvote.inference.server.refusal import Refusal, bad_request

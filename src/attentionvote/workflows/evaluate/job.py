@@ -78,9 +78,6 @@ class EvaluationJob:
 
         scenes = scenes_of(self.cfg, self.part)
         if not isinstance(scenes, EvaluationSet):
-            from attentionvote.measurement.dataset_scenes import DatasetScenes
-
-            assert isinstance(scenes, DatasetScenes)
             scenes.check_unseen(self.bundle.card.data)
         elif (made := scenes.scenes.digest) in self.bundle.card.data.values():
             raise ValueError(

@@ -15,6 +15,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeAlias
 
 from attentionvote.inference.errors import BundleError, RegistryError
 from attentionvote.inference.fetching.bundles import DIGITS, FetchedBundles
@@ -212,6 +213,9 @@ class Following:
             origin = self._bundles.origin_of(current.digest)
             if origin != current.origin:
                 self._serving.swap(dataclasses.replace(current, origin=origin))
+
+
+Watch: TypeAlias = BundleWatch | Following  # what keeps the model up to date
 
 
 def _target(link: Path) -> str | None:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.server.json_logs import say
@@ -23,23 +23,6 @@ from attentionvote.inference.server.model.serving import Served, Serving
 
 T = TypeVar("T")
 _FIRST_RETRY_S, _LAST_RETRY_S = 2.0, 300.0  # the same bundle again: disks get free, networks come back
-
-
-class Watch(Protocol):
-    """What the application asks of whatever keeps the model up to date."""
-
-    @property
-    def problem(self) -> str | None:
-        """Why what should serve does not; None: it does."""
-
-    async def run(self) -> None:
-        """Keep it up to date until cancelled."""
-
-    async def check(self) -> str | None:
-        """Look now, and say why it does not serve (None: it does)."""
-
-    def close(self) -> None:
-        """Begin nothing more."""
 
 
 class BundleWatch:

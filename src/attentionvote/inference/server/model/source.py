@@ -17,8 +17,8 @@ from attentionvote.inference.fetching.registry import Registry
 from attentionvote.inference.server.access import is_loopback
 from attentionvote.inference.server.metrics import Metrics
 from attentionvote.inference.server.model.bundle_loading import BundleLoader
-from attentionvote.inference.server.model.following import Following
-from attentionvote.inference.server.model.reloading import BundleWatch, Watch
+from attentionvote.inference.server.model.following import Following, Watch
+from attentionvote.inference.server.model.reloading import BundleWatch
 from attentionvote.inference.server.model.serving import Serving
 
 

@@ -13,7 +13,7 @@ from starlette.routing import Route
 from attentionvote.inference.server.answering import Answering
 from attentionvote.inference.server.bounded_json import parse_json
 from attentionvote.inference.server.deadline import Deadline
-from attentionvote.inference.server.model.reloading import Watch
+from attentionvote.inference.server.model.following import Watch
 from attentionvote.inference.server.model.serving import Served
 from attentionvote.inference.server.protocol.answer import EXTENSIONS, model_config, model_metadata
 from attentionvote.inference.server.protocol.request import LENGTH_HEADER
