@@ -32,6 +32,18 @@ def surface_moments(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> 
     return total, centroid, np.asarray(second) / total
 
 
+def uniform_points(
+    triangles: NDArray[np.float64], count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points ``(count, 3)`` uniform on triangles ``(F, 3, 3)``, and the triangle ``(count,)`` of each."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    index = rng.choice(len(area), size=count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return a[index] + u * (b[index] - a[index]) + v * (c[index] - a[index]), index
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """A rigid part.
@@ -103,12 +115,7 @@ class Part:
 
     def surface_points(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """``(count, 3)`` points uniform on the surface, part frame, metres."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        index = rng.choice(len(area), size=count, p=area / area.sum())
-        u, v = rng.random((2, count, 1))
-        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        return a[index] + u * (b[index] - a[index]) + v * (c[index] - a[index])
+        return uniform_points(self.vertices[self.faces], count, rng)[0]
 
 
 @dataclass(frozen=True, eq=False)

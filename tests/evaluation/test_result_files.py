@@ -1,4 +1,4 @@
-"""Sileane's JSON files: what is written is read again, and what is wrong is named in one sentence."""
+"""Sileane's JSON files: what others write is read, and what is wrong is named in one sentence."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import json
 
 import numpy as np
 import pytest
+from result_writing import write_ground_truth, write_results
 
 from attentionvote.evaluation import (
     read_ground_truth,
     read_results,
     read_scene_results,
-    write_ground_truth,
-    write_results,
 )
 
 
@@ -20,7 +19,7 @@ def entry(**change) -> dict:
     return {"R": np.eye(3).tolist(), "t": [0.1, 0.2, 0.3], "score": 1.5} | change
 
 
-def test_files_round_trip_exactly(tmp_path, make_poses):
+def test_files_are_read_exactly(tmp_path, make_poses):
     rng = np.random.default_rng(0)
     poses, scores, occlusion = make_poses(rng, 5), rng.random(5) * 300, rng.random(5)
     write_results(tmp_path / "deep" / "a.json", poses, scores)
@@ -31,7 +30,6 @@ def test_files_round_trip_exactly(tmp_path, make_poses):
     ):
         np.testing.assert_array_equal(got, poses)
         np.testing.assert_array_equal(values, wanted)
-    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["a.json", "b.json"]
 
 
 def test_rows_of_r_are_rows(tmp_path):
@@ -43,7 +41,6 @@ def test_rows_of_r_are_rows(tmp_path):
 
 def test_no_result_is_an_empty_list(tmp_path):
     write_results(tmp_path / "a.json", np.zeros((0, 4, 4)), [])
-    assert json.loads((tmp_path / "a.json").read_text()) == []
     poses, scores = read_results(tmp_path / "a.json")
     assert (poses.shape, scores.shape) == ((0, 4, 4), (0,))
 
@@ -74,15 +71,6 @@ def test_reading_names_file_entry_and_rule(tmp_path, content, text):
 def test_reading_a_missing_file_is_one_sentence(tmp_path):
     with pytest.raises(ValueError, match="the file cannot be read \\(No such file or directory\\)"):
         read_ground_truth(tmp_path / "none.json")
-
-
-@pytest.mark.parametrize(
-    ("scores", "text"), [([1.0], "one score a pose is needed, got 2 poses and 1"), ([1, np.nan], "must be finite")]
-)
-def test_writing_refuses_and_leaves_nothing(tmp_path, scores, text):
-    with pytest.raises(ValueError, match=text):
-        write_results(tmp_path / "a.json", np.stack([np.eye(4)] * 2), scores)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_scenes_are_those_with_a_result_file(tmp_path):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from surface_symmetry import symmetry_residual
 
 from attentionvote.geometry.pose import rotation_about
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
 from attentionvote.simulation.mesh import largest_vertex_distance
-from attentionvote.simulation.symmetry_detection import symmetry_residual
 
 NOMINAL_MM = {
     "connecting_rod": 143,

@@ -12,13 +12,13 @@ import part
 import pytest
 import trimesh
 from omegaconf import OmegaConf
+from surface_symmetry import symmetry_residual
 
 from attentionvote.command.conf_folder import CONF
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.section import Target
-from attentionvote.simulation.symmetry_detection import symmetry_residual
 from attentionvote.workflows.settings import PartSettings
 
 

@@ -35,7 +35,7 @@ from attentionvote.baselines.hypotheses import apart, fits, merged, placed
 from attentionvote.baselines.opencv import surface_matching, thinned, threads
 from attentionvote.baselines.settings import PpfSettings
 from attentionvote.geometry.pose import transform
-from attentionvote.part import Part
+from attentionvote.part import Part, uniform_points
 
 Array = NDArray[np.float64]
 _MODEL_POINTS, _FIT_POINTS = 30_000, 1_500
@@ -157,14 +157,10 @@ class PpfDetector:
 
 def _surface(part: Part, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Points uniform on the surface and outward normals ``(count, 6)``, part frame, metres."""
-    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    points, faces = uniform_points(part.vertices[part.faces], count, rng)
+    a, b, c = (part.vertices[part.faces[faces, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
-    area = np.linalg.norm(cross, axis=1)
-    faces = rng.choice(len(area), size=count, p=area / area.sum())
-    u, v = rng.random((2, count, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    points = a[faces] + u * (b - a)[faces] + v * (c - a)[faces]
-    return np.concatenate([points, (cross[faces] / area[faces, None])], axis=1).astype(np.float32)
+    return np.concatenate([points, cross / np.linalg.norm(cross, axis=1, keepdims=True)], axis=1).astype(np.float32)
 
 
 def _checked(points: NDArray[np.floating], normals: NDArray[np.floating] | None) -> NDArray[np.float32]:

@@ -89,13 +89,11 @@ def check_dataset(
     verdict = placement.judge()
     if verdict.is_wrong:
         remedy = f": with {verdict.remedy} they would, so the frame is mixed up" if verdict.remedy else ""
-        findings.append(
-            Finding(
-                "error",
-                f"{where}: poses must lie on the points of their instance, {verdict.misplaced} of "
-                f"{verdict.looked_at} are farther than D from them{remedy}",
-            )
+        sentence = (
+            f"{where}: poses must lie on the points of their instance, {verdict.misplaced} of "
+            f"{verdict.looked_at} are farther than D from them{remedy}"
         )
+        findings.append(Finding("error", sentence))
     findings.sort(key=lambda finding: finding.severity != "error")
     return Report(dataset, _scored(dataset), _expected(dataset), opened, instances, verdict, tuple(findings))
 
@@ -130,34 +128,21 @@ def _of_files(dataset: Dataset, where: str, findings: list[Finding]) -> dict[str
 
 
 def _of_counts(dataset: Dataset, where: str) -> list[Finding]:
-    findings = []
+    warnings = []
     scored, expected = _scored(dataset), _expected(dataset)
     if expected is not None and scored is not None and scored != expected:
         what = "the Sileane set" if dataset.format == "sileane" else "the paper's Table 1"
-        findings.append(
-            Finding(
-                "warning",
-                f"{where}: {what} has {expected} scenes with at least {LEAST_DROPS} drops, here are {scored}",
-            )
+        warnings.append(f"{what} has {expected} scenes with at least {LEAST_DROPS} drops, here are {scored}")
+    paper_set = isinstance(dataset, IpaDataset) and not dataset.is_generated
+    if paper_set and dataset.benchmark and dataset.split not in ("train", "test", "real"):
+        warnings.append("the folder's name says neither train nor test, so the counts are not compared")
+    if paper_set and dataset.parts == ("ring_screw",) and dataset.split == "test":
+        warnings.append(
+            "depth and labels of the synthetic test set of the ring screw are known not to fit (paper section 4.1): "
+            "use the real one"
         )
-    if isinstance(dataset, IpaDataset) and not dataset.is_generated:
-        if dataset.benchmark and dataset.split not in ("train", "test", "real"):
-            findings.append(
-                Finding(
-                    "warning",
-                    f"{where}: the folder's name says neither train nor test, so the counts are not compared",
-                )
-            )
-        if dataset.parts == ("ring_screw",) and dataset.split == "test":
-            findings.append(
-                Finding(
-                    "warning",
-                    f"{where}: depth and labels of the synthetic test set of the ring screw are known not to fit "
-                    "(paper section 4.1): use the real one",
-                )
-            )
-        findings += _of_cycles(dataset, where)
-    return findings
+    findings = [Finding("warning", f"{where}: {sentence}") for sentence in warnings]
+    return findings + (_of_cycles(dataset, where) if isinstance(dataset, IpaDataset) and paper_set else [])
 
 
 def _of_cycles(dataset: IpaDataset, where: str) -> list[Finding]:
@@ -177,20 +162,14 @@ def _of_cycles(dataset: IpaDataset, where: str) -> list[Finding]:
 def _of_labels(frame: Frame, name: str) -> list[tuple[str, str]]:
     findings = []
     if frame.unknown_pixels:
-        findings.append(
-            ("unknown", f"every label must be an instance's, {frame.unknown_pixels} pixels of {name} have another")
-        )
+        sentence = f"every label must be an instance's, {frame.unknown_pixels} pixels of {name} have another"
+        findings.append(("unknown", sentence))
     pixels = np.bincount(frame.instance[frame.instance >= 0], minlength=len(frame.ground_truth.part_ids))
     empty = np.flatnonzero((pixels == 0) & (frame.ground_truth.visible_fraction >= CLEARLY_VISIBLE))
     if len(empty):
         row = int(empty[0])
-        findings.append(
-            (
-                "empty",
-                f"every visible part must have pixels, part {row} of {name} is visible to "
-                f"{frame.ground_truth.visible_fraction[row]:.0%} and has none",
-            )
-        )
+        visible = f"part {row} of {name} is visible to {frame.ground_truth.visible_fraction[row]:.0%}"
+        findings.append(("empty", f"every visible part must have pixels, {visible} and has none"))
     return findings
 
 

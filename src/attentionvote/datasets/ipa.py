@@ -208,11 +208,6 @@ class IpaDataset(Dataset):
         """Half a turn about z."""
         return OPENCV_FROM_IPA
 
-    @property
-    def cycles(self) -> int:
-        """Number of drop cycles."""
-        return len(self._part_of_cycle)
-
     def _collect(self, folder: Path) -> None:
         depth, gt, labels = "p_depth", "gt", "p_segmentation"
         if self.real:

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from attentionvote.geometry.pose import transform
+from attentionvote.geometry.pose import rotation_problem, transform
 
-# Sileane's own matrices are orthonormal to 2.6e-6, float32 stays far below this; a mistake does not.
-ROTATION_TOLERANCE = 1e-3
 # No bin-picking sensor looks this far in metres, and no part is this near in millimetres.
 FARTHEST = 20.0
 
@@ -73,12 +71,6 @@ def _shaped(
         raise ValueError(f"{where}: every pose must have R and t, got {len(r)} rotations and {len(t)} translations")
     if not (np.isfinite(r).all() and np.isfinite(t).all()):
         raise ValueError(f"{where}: poses must be finite, got NaN or inf")
-    deviation = np.abs(r @ np.swapaxes(r, -1, -2) - np.eye(3)).max((-2, -1), initial=0.0)
-    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (np.linalg.det(r) < 0))
-    if len(wrong):
-        i = wrong[0]
-        raise ValueError(
-            f"{where}: R of entry {i} must be a rotation (R R^T = I within {ROTATION_TOLERANCE}, determinant +1), "
-            f"got a deviation of {deviation[i]:.3g} and determinant {np.linalg.det(r[i]):.3g}"
-        )
+    if problem := rotation_problem(r):
+        raise ValueError(f"{where}: R of entry {problem[0]} {problem[1]}")
     return r, t

@@ -17,7 +17,7 @@ from attentionvote.drawing.figures import new_figure
 Array = NDArray[np.float64]
 View = Literal["camera", "side"]
 
-CORRECT, WRONG, TRUTH, POINTS = "#0A8F3C", "#D62728", "#8A8A8A", "#C4C4C4"
+CORRECT, WRONG, TRUTH = "#0A8F3C", "#D62728", "#8A8A8A"
 # Columns of a camera-frame point drawn to the right, drawn downwards, and the viewing direction (OpenCV: y down,
 # z away from the camera). From the side the camera is above: z points down.
 VIEWS: dict[View, tuple[int, int, Array]] = {

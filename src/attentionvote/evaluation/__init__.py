@@ -14,8 +14,6 @@ from attentionvote.evaluation.result_files import (
     read_ground_truth,
     read_results,
     read_scene_results,
-    write_ground_truth,
-    write_results,
 )
 from attentionvote.evaluation.scene_result import Distance, SceneResult
 from attentionvote.evaluation.scores import Curves, ap_by_threshold, curves, evaluate, evaluate_at
@@ -47,6 +45,4 @@ __all__ = [
     "rotation_errors",
     "scene_weights",
     "score_curve",
-    "write_ground_truth",
-    "write_results",
 ]

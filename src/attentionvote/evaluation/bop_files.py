@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.evaluation.mssd import symmetry_transforms
-from attentionvote.evaluation.result_files import read_json, rotation_problem
+from attentionvote.evaluation.result_files import read_json
 from attentionvote.evaluation.scene_result import Array
-from attentionvote.geometry.pose import transform
+from attentionvote.geometry.pose import rotation_problem, transform
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 NAME_RULE = "METHOD_DATASET-SPLIT[-TYPE][_ID].csv"

@@ -9,9 +9,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from attentionvote.evaluation.pose_distance import PoseMetric
-from attentionvote.evaluation.result_files import read_json, rotation_problem
+from attentionvote.evaluation.result_files import read_json
 from attentionvote.evaluation.scene_result import Array
-from attentionvote.geometry.pose import inverse, quaternion_from_matrix, transform
+from attentionvote.geometry.pose import inverse, quaternion_from_matrix, rotation_problem, transform
 from attentionvote.geometry.symmetry import Symmetry
 
 Frame = Literal["toolbox", "object"]

@@ -12,14 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from attentionvote.evaluation.scene_result import Array, SceneResult
-from attentionvote.files import write_whole
-from attentionvote.geometry.pose import transform
-
-# Sileane's own matrices are orthonormal to 2.6e-6; a detector that writes float32 stays far below this too.
-ROTATION_TOLERANCE = 1e-3
+from attentionvote.geometry.pose import rotation_problem, transform
 
 
 def read_json(path: str | Path) -> Any:
@@ -54,16 +49,6 @@ def read_results(path: str | Path) -> tuple[Array, Array]:
     return _read(path, "score")
 
 
-def write_ground_truth(path: str | Path, poses: ArrayLike, occlusion: ArrayLike) -> None:
-    """Write poses ``(I, 4, 4)`` and occlusion rates ``(I,)``; atomic."""
-    _write(path, poses, occlusion, "occlusion_rate")
-
-
-def write_results(path: str | Path, poses: ArrayLike, scores: ArrayLike) -> None:
-    """Write poses ``(R, 4, 4)`` and scores ``(R,)``; no result writes ``[]``, which counts; atomic."""
-    _write(path, poses, scores, "score")
-
-
 def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -> dict[str, SceneResult]:
     """Every scene that has a result file, by name (sorted).
 
@@ -96,20 +81,6 @@ def read_scene_results(gt_directory: str | Path, result_directory: str | Path) -
     if problem := unit_problem(estimated, true, "metres", "millimetres"):
         raise ValueError(f"{result_directory}: {problem}")
     return scenes
-
-
-def rotation_problem(rotations: Array) -> tuple[int, str] | None:
-    """Index of the first of ``(N, 3, 3)`` that is no rotation and the end of a sentence about it, or None."""
-    deviation = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max((-2, -1), initial=0.0)
-    determinant = np.linalg.det(rotations)
-    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (determinant < 0))
-    if not len(wrong):
-        return None
-    i = int(wrong[0])
-    return i, (
-        f"must be a rotation (R R^T = I within {ROTATION_TOLERANCE}, determinant +1), "
-        f"got a deviation of {deviation[i]:.3g} and determinant {determinant[i]:.3g}"
-    )
 
 
 def unit_problem(translations: Array, gt_translations: Array, unit: str, other: str) -> str:
@@ -166,17 +137,3 @@ def _entry(path: str | Path, index: int, entry: dict, key: str, shape: tuple[int
         wanted = {(): "a finite number", (3,): "three finite numbers", (3, 3): "3x3 finite numbers"}[shape]
         raise ValueError(f"{path}: {key} of entry {index} must be {wanted}, got {entry[key]!r}")
     return value
-
-
-def _write(path: str | Path, poses: ArrayLike, values: ArrayLike, value_key: str) -> None:
-    p = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
-    v = np.asarray(values, dtype=np.float64).reshape(-1)
-    if len(p) != len(v):
-        raise ValueError(f"{path}: one {value_key} a pose is needed, got {len(p)} poses and {len(v)} values")
-    if not (np.isfinite(p).all() and np.isfinite(v).all()):
-        raise ValueError(f"{path}: poses and {value_key} must be finite, got NaN or inf")
-    entries = [
-        {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist(), value_key: float(value)}
-        for pose, value in zip(p, v, strict=True)
-    ]
-    write_whole(Path(path), json.dumps(entries, indent=1))

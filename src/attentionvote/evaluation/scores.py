@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
 from attentionvote.evaluation.average_precision import DetectionScores, score_tables
@@ -160,23 +159,16 @@ class Curves:
     at_10: DetectionScores
 
 
-def curves(
-    scenes: Sequence[SceneResult],
-    part: Part,
-    metric: PoseMetric | None = None,
-    thresholds: NDArray[np.float64] | Sequence[float] = tuple(k / 200 for k in range(21)),
-    occlusion_limit: float = 0.5,
-    result_limit: int | None = None,
-) -> Curves:
+def curves(scenes: Sequence[SceneResult], part: Part) -> Curves:
     """Precision-recall curve at 10 % D, and AP against the threshold (0 to 10 % D in steps of half a per cent).
 
     Raises:
-        ValueError: when there is no scene, or a limit is impossible.
+        ValueError: when there is no scene.
     """
-    tables = distance_tables(scenes, metric or PoseMetric.of(part))
-    fractions = np.asarray(thresholds, dtype=np.float64)
-    ap = [score_tables(scenes, tables, t * part.diameter, occlusion_limit, result_limit).ap for t in fractions]
-    at_10 = score_tables(scenes, tables, DETAIL_THRESHOLD * part.diameter, occlusion_limit, result_limit)
+    tables = distance_tables(scenes, PoseMetric.of(part))
+    fractions = np.array([k / 200 for k in range(21)])
+    ap = [score_tables(scenes, tables, t * part.diameter).ap for t in fractions]
+    at_10 = score_tables(scenes, tables, DETAIL_THRESHOLD * part.diameter)
     return Curves(at_10.curve_precision, at_10.curve_recall, at_10.curve_scores, fractions, np.asarray(ap), at_10)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+# Sileane's own matrices are orthonormal to 2.6e-6, float32 stays far below this; a mistake does not.
+ROTATION_TOLERANCE = 1e-3
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
@@ -100,3 +102,17 @@ def apply(pose: ArrayLike, points: ArrayLike) -> Array:
     """Points ``(..., P, 3)`` of the source frame in the target frame of ``pose`` ``(..., 4, 4)``."""
     p, x = np.asarray(pose, dtype=np.float64), np.asarray(points, dtype=np.float64)
     return x @ np.swapaxes(p[..., :3, :3], -1, -2) + p[..., None, :3, 3]
+
+
+def rotation_problem(rotations: Array) -> tuple[int, str] | None:
+    """Index of the first of ``(N, 3, 3)`` that is no rotation and the end of a sentence about it, or None."""
+    deviation = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max((-2, -1), initial=0.0)
+    determinant = np.linalg.det(rotations)
+    wrong = np.flatnonzero((deviation > ROTATION_TOLERANCE) | (determinant < 0))
+    if not len(wrong):
+        return None
+    i = int(wrong[0])
+    return i, (
+        f"must be a rotation (R R^T = I within {ROTATION_TOLERANCE}, determinant +1), "
+        f"got a deviation of {deviation[i]:.3g} and determinant {determinant[i]:.3g}"
+    )

@@ -62,26 +62,19 @@ def run_cycles(
     if not progress:
         yield from simulated
         return
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("cycles, {task.fields[scenes]} new scenes"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        rich.TextColumn("{task.description}"),
+        rich.BarColumn(),
+        rich.MofNCompleteColumn(),
+        rich.TextColumn("cycles, {task.fields[scenes]} new scenes"),
+        rich.TimeElapsedColumn(),
+        rich.TextColumn("left"),
+        rich.TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=120) as bar:
+    with rich.Progress(*columns, console=Console(stderr=True), speed_estimate_period=120) as bar:
         task = bar.add_task(title, total=done + len(cycles), completed=done, scenes=0)
         scenes = 0
         for cycle, records in simulated:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from attentionvote.geometry.pose import rotation_about
+from attentionvote.part import uniform_points
 
 Array = NDArray[np.float64]
 
@@ -145,7 +146,7 @@ class RotationCheck:
         self.tolerance = tolerance
         self.radius = float(np.linalg.norm(vertices, axis=1).max())
         corners = vertices[rng.permutation(np.unique(faces))[:TEST_POINTS]]
-        self.points = rng.permutation(np.concatenate([_uniform(vertices[faces], rng), corners]))
+        self.points = rng.permutation(np.concatenate([uniform_points(vertices[faces], TEST_POINTS, rng)[0], corners]))
         # The outermost points move most, so a screening set of half of them fails a wrong rotation at once.
         outer = np.argsort(-np.linalg.norm(self.points, axis=1))[: SCREEN_POINTS // 2]
         self.screen = np.concatenate([self.points[outer], self.points[: SCREEN_POINTS // 2]])
@@ -194,13 +195,3 @@ class RotationCheck:
                 break
             result = rotation_about(step, min(angle, 0.1)) @ result
         return result
-
-
-def _uniform(corners: Array, rng: np.random.Generator) -> Array:
-    """``TEST_POINTS`` points ``(N, 3)`` uniform on the triangles ``(F, 3, 3)``."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    index = rng.choice(len(area), size=TEST_POINTS, p=area / area.sum())
-    u, v = rng.random((2, TEST_POINTS, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return np.asarray(a[index] + u * (b - a)[index] + v * (c - a)[index])

@@ -94,13 +94,6 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
     )
 
 
-def symmetry_residual(vertices: Array, faces: NDArray[np.int64], symmetry: Symmetry) -> float:
-    """Largest distance in metres between the surface and its images under ``symmetry`` (about the origin)."""
-    tolerance = TOLERANCE * largest_vertex_distance(vertices)
-    check = RotationCheck(np.asarray(vertices, dtype=np.float64), faces, tolerance)
-    return max((check.residual(r) for r in tested_rotations(symmetry)), default=0.0)
-
-
 def tested_rotations(symmetry: Symmetry) -> Array:
     """The rotations ``(R, 3, 3)`` that are checked for ``symmetry``: all of a finite group but the identity,
     16 incommensurable turns of a body of revolution and their products with the flip."""

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import score
+from result_writing import write_ground_truth, write_results
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.evaluation import write_ground_truth, write_results
 from attentionvote.workflows.settings import ScoreSettings
 
 # threshold_scale: AP, F1, MAP, R99, R50, TP, FP, FN

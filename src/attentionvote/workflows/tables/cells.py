@@ -40,16 +40,13 @@ class CellFailed(Exception):
     """A cell that was to be measured could not be; one sentence."""
 
 
-def network_cell(
-    words: dict[str, tuple[str, ...]], name: str, may_train: bool, logs: Path | None = None
-) -> dict[str, Any] | None:
+def network_cell(words: dict[str, tuple[str, ...]], name: str, may_train: bool) -> dict[str, Any] | None:
     """The cell of a model, from verbs that do nothing when it is there already.
 
     Args:
         words: of ``train``, ``export`` and ``evaluate``.
         name: of the part.
         may_train: otherwise a model that is not trained is None.
-        logs: see ``MemberTask``.
 
     Raises:
         CellFailed: when a verb failed.
@@ -61,7 +58,7 @@ def network_cell(
     job = find_training(cfg)
     if job.result is None and not may_train:
         return None
-    answers = MemberTask(words, logs)(name)
+    answers = MemberTask(words, None)(name)
     if answers.get("failed"):
         raise CellFailed(f"{answers['failed']} failed, {answers['sentence']}")
     trained, evaluated = answers["train"], answers["evaluate"]

@@ -34,22 +34,14 @@ def markdown(table: BenchmarkTable, cells: Cells, picture: str | None) -> str:
         of = f", {title_of(figure)}" if len(table.figures) > 1 else ""
         for paper_row in table.paper:
             if paper_row.figure == figure:
-                lines.append(
-                    _line(
-                        f"paper: {paper_row.method}{of}",
-                        [_number(v) for v in paper_row.values],
-                        paper_row.values,
-                        several,
-                    )
-                )
+                texts = [_number(v) for v in paper_row.values]
+                lines.append(_line(f"paper: {paper_row.method}{of}", texts, paper_row.values, several))
         for row in table.measured:
             row_cells = [cells.get((row.name, name)) for name in objects]
             values = [None if cell is None else cell["figures"].get(figure) for cell in row_cells]
             texts = [NOT_RUN if cell is None else _number(v) for cell, v in zip(row_cells, values, strict=True)]
-            if any(text != NOT_RUN for text in texts):
-                lines.append(_line(f"**{row.name}**{of}", texts, values, several))
-            else:
-                lines.append(_line(f"{row.name}{of}", texts, values, several))
+            shown = f"**{row.name}**" if any(text != NOT_RUN for text in texts) else row.name
+            lines.append(_line(shown + of, texts, values, several))
     return "\n".join([*lines, "", *_costs(table, cells)]) + "\n"
 
 

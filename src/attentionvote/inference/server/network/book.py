@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 import resource
 import time
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from attentionvote.inference.server.json_logs import say
 from attentionvote.inference.server.metrics import Closed, Metrics
+
+if TYPE_CHECKING:
+    from attentionvote.inference.server.network.connection import CellConnection
 
 HEALTH_CONNECTIONS = 8
 _MOST_CONNECTIONS, _FEWEST_CONNECTIONS = 256, 8
@@ -17,25 +20,6 @@ _MOST_HANDLES = 4096
 # and the files of that bundle.
 _RESERVED_HANDLES = 56
 _SAY_AGAIN_S = 60.0
-
-
-class Entry(Protocol):
-    """What the book knows of a connection.
-
-    Attributes:
-        silent_since: of the monotonic clock: its last byte.
-        busy: whether a request is in progress.
-        spare: whether it was let in beyond the limit, for questions about health.
-    """
-
-    silent_since: float
-    spare: bool
-
-    @property
-    def busy(self) -> bool: ...
-
-    def give_way(self) -> None:
-        """End at once."""
 
 
 def raise_handle_limit() -> int:
@@ -69,11 +53,11 @@ class ConnectionBook:
 
     def __init__(self, most: int, metrics: Metrics) -> None:
         self.most = most
-        self.entries: set[Entry] = set()
+        self.entries: set[CellConnection] = set()
         self._metrics = metrics
         self._quiet_until: dict[str, float] = {}
 
-    def admit(self, entry: Entry) -> bool:
+    def admit(self, entry: CellConnection) -> bool:
         """Enter a new connection; where all places are taken, the longest silent one without a request gives way.
 
         Returns:
@@ -88,12 +72,12 @@ class ConnectionBook:
         self._metrics.connections.set(len(self.entries))
         return True
 
-    def health_only(self, entry: Entry) -> bool:
+    def health_only(self, entry: CellConnection) -> bool:
         """Whether a connection may ask about health only: it was let in beyond the limit, which still is exceeded."""
         entry.spare = entry.spare and len(self.entries) > self.most
         return entry.spare
 
-    def remove(self, entry: Entry) -> None:
+    def remove(self, entry: CellConnection) -> None:
         """A connection has ended."""
         self.entries.discard(entry)
         self._metrics.connections.set(len(self.entries))

@@ -63,7 +63,7 @@ class CellServer(uvicorn.Server):
                 await self._accepting
         self._listener.close()
         for entry in list(self._book.entries):
-            if isinstance(entry, CellConnection) and entry.transport is None:
+            if entry.transport is None:
                 entry.give_way()
         await super().shutdown(sockets=[])
 
