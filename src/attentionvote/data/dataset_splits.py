@@ -5,7 +5,6 @@ Only scenes with at least five drops are taken, as the paper counts them (Table 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -19,7 +18,6 @@ from attentionvote.datasets.recognition import split_of
 from attentionvote.part import Part
 from attentionvote.simulation.sensor import Sensor
 
-log = logging.getLogger(__name__)
 SPLITS = ("train", "val", "test")
 _LOOKED_AT = 4_000  # points of the scene whose frame is checked
 

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.datasets.benchmark_objects import benchmark_object
-from attentionvote.datasets.dataset import Dataset, Frame, GroundTruth, rows_of_labels
-from attentionvote.datasets.depth_image import DepthCoding, PinholeCamera, read_depth_counts, read_labels
+from attentionvote.datasets.dataset import Frame, GroundTruth
+from attentionvote.datasets.depth_image import DepthCoding, PinholeCamera
 from attentionvote.datasets.pose_rules import check_depth_range, poses_in_metres
+from attentionvote.datasets.scene_files import SceneFiles
 from attentionvote.datasets.text_files import number, read_json, read_text
-from attentionvote.scene import BACKGROUND
 
 OPENCV_FROM_IPA = np.diag([-1.0, -1.0, 1.0, 1.0])
 ROTATION_COLUMNS = tuple(f"rot_{axis}_axis_{i}" for axis in "xyz" for i in (1, 2, 3))
@@ -113,7 +113,7 @@ def read_ground_truth(path: Path) -> GroundTruth:
     return GroundTruth(OPENCV_FROM_IPA @ poses, np.minimum(visible, 1.0), np.zeros(len(ids), np.int32), ids)
 
 
-class IpaDataset(Dataset):
+class IpaDataset(SceneFiles):
     """All parts (``_part_1``, ``_part_2``, ...) of one object in one split.
 
     Args:
@@ -167,41 +167,24 @@ class IpaDataset(Dataset):
             )
         return truth
 
-    def truth_bytes(self, name: str) -> bytes:
-        """The CSV file."""
-        return self._file(name, "gt").read_bytes()
-
     def picture_rule(self, name: str) -> str:
         """What ``parameter.json`` of the scene's part says."""
         return repr(self._parameters(name))
 
     def frame(self, name: str, labels: bool = True) -> Frame:
         """The picture of a scene; the background is the picture of the same cycle's empty bin."""
-        camera = self._parameters(name).camera
-        depth = self._depth(name)
-        truth = self.ground_truth(name) if labels else GroundTruth.none()
-        instance, unknown = np.full(depth.shape, BACKGROUND, np.int32), 0
-        if labels and self.has_labels:
-            path = self._file(name, "labels")
-            image = read_labels(path)
-            camera.check_size(image, str(path))
-            instance, unknown = rows_of_labels(image, truth.label_ids, (LABEL_OF_BIN, LABEL_OF_NOTHING))
+        depth, truth, instance, unknown = self._seen(name, labels, (LABEL_OF_BIN, LABEL_OF_NOTHING))
         empty = f"{name.partition('/')[0]}/000"
         return Frame(
             depth=depth,
             instance=instance,
             unknown_pixels=unknown,
-            camera=camera,
+            camera=self.camera(name),
             ground_truth=truth,
             background=self._depth(empty) if empty in self._files["depth"] else None,
             background_tolerance=REAL_TOLERANCE if self.real else 0.0,
             nearest=self.benchmark.nearest if self.real and self.benchmark else None,
         )
-
-    def missing_files(self) -> dict[str, list[str]]:
-        """See ``Dataset``; labels of real pictures are missed only when some are there."""
-        kinds = ["depth", "gt", *(["labels"] if self.has_labels else [])]
-        return {kind: [name for name in self.names if name not in self._files[kind]] for kind in kinds}
 
     @property
     def camera_from_file(self) -> NDArray[np.float64]:
@@ -233,20 +216,11 @@ class IpaDataset(Dataset):
                     )
                 self._files[kind][f"{cycle}/{int(count):03d}"] = path
 
-    def _file(self, name: str, kind: str) -> Path:
-        path = self._files[kind].get(self._checked(name))
-        if path is None:
-            raise ValueError(f"{self.directory}: scene {name} has no file of its {kind}")
-        return path
-
     def _parameters(self, name: str) -> IpaParameters:
         folder = self._part_of_cycle[self._checked(name).partition("/")[0]]
         if folder not in self._by_folder:
             self._by_folder[folder] = read_parameters(folder / "parameter.json")
         return self._by_folder[folder]
 
-    def _depth(self, name: str) -> NDArray[np.float64]:
-        path = self._file(name, "depth")
-        counts = read_depth_counts(path)
-        self._parameters(name).camera.check_size(counts, str(path))
-        return self._parameters(name).coding.decode(counts)
+    def _coding(self, name: str) -> DepthCoding:
+        return self._parameters(name).coding

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.datasets.benchmark_objects import benchmark_object
-from attentionvote.datasets.dataset import Dataset, Frame, GroundTruth, rows_of_labels
-from attentionvote.datasets.depth_image import TOP, DepthCoding, PinholeCamera, read_depth_counts, read_labels
+from attentionvote.datasets.dataset import Frame, GroundTruth
+from attentionvote.datasets.depth_image import TOP, DepthCoding, PinholeCamera
 from attentionvote.datasets.pose_rules import check_depth_range, poses_in_metres
+from attentionvote.datasets.scene_files import SceneFiles
 from attentionvote.datasets.text_files import number, read_json, read_text
 from attentionvote.geometry.pose import inverse, matrix_from_quaternion
-from attentionvote.scene import BACKGROUND
 
 MISSING = (65535,)
 LABEL_OF_BACKGROUND = 0
@@ -100,7 +100,7 @@ def read_world_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float6
     return poses, occlusion, labels
 
 
-class SileaneDataset(Dataset):
+class SileaneDataset(SceneFiles):
     """One object of the Sileane dataset.
 
     Args:
@@ -167,10 +167,6 @@ class SileaneDataset(Dataset):
             labels,
         )
 
-    def truth_bytes(self, name: str) -> bytes:
-        """The JSON file."""
-        return self._file(name, "gt").read_bytes()
-
     def picture_rule(self, name: str) -> str:
         """What ``camera_params.txt`` says."""
         self._checked(name)
@@ -185,14 +181,7 @@ class SileaneDataset(Dataset):
         """The picture of a scene. The bin's floor is beyond a depth that is known for the paper's objects; for others
         the same cycle's scene without parts shows it.
         """
-        depth = self._depth(name)
-        truth = self.ground_truth(name) if labels else GroundTruth.none()
-        instance, unknown = np.full(depth.shape, BACKGROUND, np.int32), 0
-        if labels and self.has_labels:
-            path = self._file(name, "labels")
-            image = read_labels(path)
-            self._camera.camera.check_size(image, str(path))
-            instance, unknown = rows_of_labels(image, truth.label_ids, (LABEL_OF_BACKGROUND,))
+        depth, truth, instance, unknown = self._seen(name, labels, (LABEL_OF_BACKGROUND,))
         farthest = self.benchmark.farthest if self.benchmark else None
         empty = f"{name.rpartition('_')[0]}_000"
         by_picture = farthest is None and empty in self._files["depth"]
@@ -207,26 +196,13 @@ class SileaneDataset(Dataset):
             farthest=farthest,
         )
 
-    def missing_files(self) -> dict[str, list[str]]:
-        """See ``Dataset``."""
-        kinds = ["depth", "gt", *(["labels"] if self.has_labels else [])]
-        return {kind: [name for name in self.names if name not in self._files[kind]] for kind in kinds}
-
     @cached_property
     def _camera(self) -> SileaneCamera:
         return read_camera(self.directory / CAMERA_FILE)
 
-    def _file(self, name: str, kind: str) -> Path:
-        path = self._files[kind].get(self._checked(name))
-        if path is None:
-            raise ValueError(f"{self.directory}: scene {name} has no file of its {kind}")
-        return path
-
-    def _depth(self, name: str) -> NDArray[np.float64]:
-        path = self._file(name, "depth")
-        counts = read_depth_counts(path)
-        self._camera.camera.check_size(counts, str(path))
-        return self._camera.coding.decode(counts)
+    def _coding(self, name: str) -> DepthCoding:
+        del name
+        return self._camera.coding
 
 
 def _order(name: str) -> tuple[str, int, int]:

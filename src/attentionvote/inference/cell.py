@@ -38,7 +38,7 @@ class CloudUnit:
         InputError: when it is another one.
     """
 
-    unit: str = "m"
+    unit: str
 
     def __post_init__(self) -> None:
         if not isinstance(self.unit, str) or self.unit not in _UNITS_A_METRE:
@@ -71,7 +71,7 @@ class Cell:
 
     camera: CameraIntrinsics | None = None
     crop: Crop | None = None
-    cloud: CloudUnit = CloudUnit()
+    cloud: CloudUnit = CloudUnit("m")
 
 
 def read_cell(path: Path | str) -> Cell:
@@ -115,21 +115,16 @@ def parse_cell(content: bytes) -> Cell:
         raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"it must be JSON, got a text that is none ({error})") from error
-    _check_keys("the cell", described, ("camera", "bin", "cloud"), ())
-    camera = crop = None
-    cloud = CloudUnit()
-    if "camera" in described:
-        names = [f.name for f in fields(CameraIntrinsics)]
-        needed = [f.name for f in fields(CameraIntrinsics) if f.default is MISSING]
-        _check_keys("camera", described["camera"], names, needed)
-        camera = CameraIntrinsics(**described["camera"])
-    if "bin" in described:
-        _check_keys("bin", described["bin"], ("camera_from_bin", "size", "margin"), ("camera_from_bin", "size"))
-        crop = Crop(**described["bin"])
-    if "cloud" in described:
-        _check_keys("cloud", described["cloud"], ("unit",), ("unit",))
-        cloud = CloudUnit(**described["cloud"])
-    return Cell(camera, crop, cloud)
+    sections: dict[str, type[Any]] = {"camera": CameraIntrinsics, "bin": Crop, "cloud": CloudUnit}
+    _check_keys("the cell", described, sections, ())
+    said: dict[str, Any] = {}
+    for section, kind in sections.items():
+        if section in described:
+            entries = fields(kind)
+            needed = [entry.name for entry in entries if entry.default is MISSING]
+            _check_keys(section, described[section], [entry.name for entry in entries], needed)
+            said["crop" if section == "bin" else section] = kind(**described[section])
+    return Cell(**said)
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -12,13 +12,14 @@ from typing import Any
 from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.command.tables import show_table
 from attentionvote.inference import Bundle
+from attentionvote.inference.bundles.signature import trusted_key
 from attentionvote.measurement.models import Measurement
 from attentionvote.measurement.scenes import MeasuredScenes
 from attentionvote.registry.gates import Evidence, Gate, Rules, judge
 from attentionvote.registry.history import History
 from attentionvote.registry.promotion import Standing, Superseded, move, stand
 from attentionvote.registry.versions import DATA_FACT, Version, Versions
-from attentionvote.workflows.evaluate.job import EvaluationJob, trusted_key
+from attentionvote.workflows.evaluate.job import EvaluationJob
 from attentionvote.workflows.evaluate.report import described, show
 from attentionvote.workflows.settings import PromoteSettings
 

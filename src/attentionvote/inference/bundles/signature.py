@@ -138,6 +138,16 @@ def load_public_key(path: Path) -> Ed25519PublicKey:
     return key
 
 
+def trusted_key(named: Path | str | None) -> Ed25519PublicKey:
+    """The public key whose signature bundles must have: of the file named, else ``signing.pub`` in the keys' folder.
+
+    Raises:
+        BundleError: when there is none.
+        InputError: when nothing says where the keys lie.
+    """
+    return load_public_key(keys_folder() / PUBLIC_NAME if named is None else Path(named))
+
+
 def _read(path: Path, what: str, remedy: str) -> bytes:
     try:
         with path.open("rb") as file:

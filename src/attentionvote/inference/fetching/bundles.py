@@ -74,7 +74,7 @@ class FetchedBundles:
         if not there and self.link.is_symlink():
             with self._locked():
                 self.link.unlink(missing_ok=True)
-        elif there and self._target() != there[0].digest[:DIGITS]:
+        elif there and self.target() != there[0].digest[:DIGITS]:
             with self._locked():
                 self._point(there[0])
 
@@ -141,7 +141,7 @@ class FetchedBundles:
 
     def _point(self, version: RegistryVersion) -> None:
         name = version.digest[:DIGITS]
-        if self._target() == name:
+        if self.target() == name:
             return
         new = self.folder / f"fetching-{LATEST}"
         new.unlink(missing_ok=True)
@@ -149,7 +149,8 @@ class FetchedBundles:
         os.replace(new, self.link)
         sync(self.folder)
 
-    def _target(self) -> str | None:
+    def target(self) -> str | None:
+        """The name of the folder that the link leads to; None where there is no link."""
         with contextlib.suppress(OSError):
             return os.readlink(self.link)
         return None
@@ -213,8 +214,7 @@ def fetch(registry: Registry, version: RegistryVersion, key: Ed25519PublicKey, f
     for name, content in ((MANIFEST, manifest), (SIGNATURE, signature)):
         with (folder / name).open("xb") as file:
             file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        sync(folder / name)
     for below in {folder, *((folder / name).parent for name in entries)}:
         sync(below)
     try:
@@ -236,9 +236,8 @@ def _fetch_file(registry: Registry, version: RegistryVersion, name: str, entry: 
         for piece in pieces:
             digest.update(piece)
             file.write(piece)
-        file.flush()
-        os.fsync(file.fileno())
         size = file.tell()
+    sync(path)
     if size != entry.bytes:
         raise BundleError(f"{version}: {name} must have {entry.bytes} bytes, got {size}: register the bundle again")
     if digest.hexdigest() != entry.sha256:

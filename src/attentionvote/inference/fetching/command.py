@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder, load_public_key
+from attentionvote.inference.bundles.signature import PUBLIC_NAME, trusted_key
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.fetching import access as registry_access
 from attentionvote.inference.fetching.bundles import DIGITS, FetchedBundles
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     """
     reference = parse_reference(options.reference)
     access = registry_access.access(options)
-    key = load_public_key(options.key if options.key is not None else keys_folder() / PUBLIC_NAME)
+    key = trusted_key(options.key)
     try:
         bundles = FetchedBundles(options.to, reference, key)
         registry = Registry(access)

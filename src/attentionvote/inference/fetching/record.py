@@ -68,10 +68,8 @@ class FetchRecord:
         entries = [e for e in entries[:-_MOST_ENTRIES] if e[1].digest in keep] + entries[-_MOST_ENTRIES:]
         content = [{"reference": asked, **version._asdict()} for asked, version in entries]
         new = self._folder / f"fetching-{NAME}"
-        with new.open("w", encoding="utf-8") as file:
-            json.dump({"format": _FORMAT, "bundles": content}, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
+        new.write_text(json.dumps({"format": _FORMAT, "bundles": content}, indent=1), encoding="utf-8")
+        sync(new)
         os.replace(new, self._folder / NAME)
         sync(self._folder)
         self._entries = entries

@@ -18,7 +18,7 @@ from pathlib import Path
 import uvicorn
 
 from attentionvote.inference.bundles.bundle import Bundle
-from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder, load_public_key
+from attentionvote.inference.bundles.signature import PUBLIC_NAME, trusted_key
 from attentionvote.inference.cell import cell_bytes
 from attentionvote.inference.errors import BundleError, InputError
 from attentionvote.inference.fetching import access as registry_access
@@ -152,7 +152,7 @@ def _checked(options: argparse.Namespace) -> _Settings:
                 f"--tls-cert and --tls-key must be a PEM certificate and its key, but they cannot be loaded: {error}"
             ) from error
     cell = cell_bytes(options.cell) if options.cell is not None else b""
-    trusted = load_public_key(options.key if options.key is not None else keys_folder() / PUBLIC_NAME)
+    trusted = trusted_key(options.key)
     state = options.state if options.state is not None else default_state(source.name)
     store, problem = None, ""
     try:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from attentionvote.inference import Bundle, load_bundle
-from attentionvote.inference.bundles.signature import PUBLIC_NAME, fingerprint, keys_folder, load_public_key
+from attentionvote.inference.bundles.signature import fingerprint, trusted_key
 from attentionvote.part import Parts
 from attentionvote.workflows.evaluate.frozen_set import scenes_of, set_spec
 from attentionvote.workflows.evaluate.settings import MeasuredBundle
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from attentionvote.measurement.models import Measurement
     from attentionvote.measurement.scenes import MeasuredScenes
     from attentionvote.scene import Scene
-
-log = logging.getLogger("attentionvote.evaluate")
 
 
 @dataclass(frozen=True)
@@ -99,15 +96,6 @@ class EvaluationJob:
 
         evaluation = self.cfg.evaluation
         return measure(bundles, frozen, evaluation.threads, shown, evaluation.peak_threshold)
-
-
-def trusted_key(named: str | None) -> Ed25519PublicKey:
-    """The public key whose signature bundles must have.
-
-    Raises:
-        ValueError: when there is none.
-    """
-    return load_public_key(keys_folder() / PUBLIC_NAME if named is None else Path(named))
 
 
 def _folder(bundles: Path, name: str, part: str) -> Path:

@@ -9,12 +9,9 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-import os
 import random
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from pathlib import Path
 from typing import TypeAlias
 
 from attentionvote.inference.errors import BundleError, RegistryError
@@ -179,8 +176,7 @@ class Following:
 
     def _ask(self, serving: frozenset[str]) -> bool:
         """Whether the link was moved. Blocking; in the thread."""
-        link = self._bundles.link
-        before = _target(link)
+        before = self._bundles.target()
         if self._bundles.pinned() is not None:
             return False  # a pin that is here needs no registry
         version = self._registry.resolve(self._bundles.reference)
@@ -197,7 +193,7 @@ class Following:
             self._retry_s = min(2 * self._retry_s, _LONGEST_RETRY_S)
             raise
         self._refused = None
-        moved = _target(link) != before
+        moved = self._bundles.target() != before
         if fetched or moved:
             say(
                 "registry", f"{self._bundles.reference} is {version}, bundle {version.digest[:DIGITS]}",
@@ -216,9 +212,3 @@ class Following:
 
 
 Watch: TypeAlias = BundleWatch | Following  # what keeps the model up to date
-
-
-def _target(link: Path) -> str | None:
-    with suppress(OSError):
-        return os.readlink(link)
-    return None

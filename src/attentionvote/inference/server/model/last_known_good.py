@@ -151,7 +151,6 @@ def _copy(source: Path, target: Path) -> None:
             folders |= {path.parent, *(p for p in path.parents if p.is_relative_to(target))}
             with path.open("xb") as file:
                 file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            sync(path)
     for folder in folders:
         sync(folder)
