@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from attentionvote.execution.failures import WorkerDied
 from attentionvote.execution.job_process import (
@@ -32,19 +32,6 @@ _POLL_S = 0.1
 _CLAIM_S = 2.0  # between looks at the claim
 
 
-class JobExecutor(Protocol):
-    """Where the jobs of one verb are started."""
-
-    def submit(self, words: Sequence[str], log: Path, environment: Mapping[str, str]) -> JobFuture:
-        """Start a job.
-
-        Args:
-            words: after the verb's script.
-            log: file that its progress is added to.
-            environment: further variables.
-        """
-
-
 @dataclass(frozen=True)
 class LocalJobs:
     """Each job a process of this machine.
@@ -56,7 +43,13 @@ class LocalJobs:
     script: Path
 
     def submit(self, words: Sequence[str], log: Path, environment: Mapping[str, str]) -> JobFuture:
-        """See ``JobExecutor``."""
+        """Start a job.
+
+        Args:
+            words: after the verb's script.
+            log: file that its progress is added to.
+            environment: further variables.
+        """
         with log.open("ab") as stderr:
             return JobProcess(self.script, words, stderr, environment)
 
@@ -80,10 +73,13 @@ class WorkerJobs:
     threads: int
 
     def submit(self, words: Sequence[str], log: Path, environment: Mapping[str, str]) -> JobFuture:
-        """See ``JobExecutor``; the log is on a disk that the worker sees."""
+        """See ``LocalJobs``; the log is on a disk that the worker sees."""
         about = {"executor": self.executor, "cluster": dict(self.cluster), "threads": self.threads}
         about |= {"script": str(self.script), "log": str(log.absolute())}
         return LocalJobs(Path(__file__)).submit(words, log, {**environment, _WORKER_JOB: json.dumps(about)})
+
+
+JobExecutor: TypeAlias = LocalJobs | WorkerJobs  # where the jobs of one verb are started
 
 
 @dataclass(frozen=True)

@@ -117,14 +117,14 @@ def parse_cell(content: bytes) -> Cell:
         raise InputError(f"it must be JSON, got a text that is none ({error})") from error
     sections: dict[str, type[Any]] = {"camera": CameraIntrinsics, "bin": Crop, "cloud": CloudUnit}
     _check_keys("the cell", described, sections, ())
-    said: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for section, kind in sections.items():
         if section in described:
             entries = fields(kind)
             needed = [entry.name for entry in entries if entry.default is MISSING]
             _check_keys(section, described[section], [entry.name for entry in entries], needed)
-            said["crop" if section == "bin" else section] = kind(**described[section])
-    return Cell(**said)
+            values["crop" if section == "bin" else section] = kind(**described[section])
+    return Cell(**values)
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -110,9 +110,9 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     for name, module, text, description in _ELSEWHERE:
         verb = verbs.add_parser(name, help=text, description=description)
         if words[:1] == [name]:
-            chosen = import_module(f"attentionvote.inference.{module}")
-            chosen.add_arguments(verb)
-            verb.set_defaults(run=chosen.run)
+            verb_module = import_module(f"attentionvote.inference.{module}")
+            verb_module.add_arguments(verb)
+            verb.set_defaults(run=verb_module.run)
 
     verb = verbs.add_parser("keys", help="make the key pair that signs bundles", description=_keys.__doc__)
     verb.add_argument("--folder", metavar="PATH", help="default: $ATTENTIONVOTE_KEYS or ~/.config/attentionvote")

@@ -32,6 +32,7 @@ def run(cfg: WriteDataSettings) -> dict[str, Any]:
     """Generate what is missing, write it; where it is and how much."""
 
     from attentionvote.datasets.dataset import RECEIPT
+    from attentionvote.datasets.ipa_writer import big_picture
     from attentionvote.part import only_part
     from attentionvote.simulation.raycast import PartCaster
     from attentionvote.simulation.scene_set import generate_scene_set
@@ -48,7 +49,7 @@ def run(cfg: WriteDataSettings) -> dict[str, Any]:
             raise ConfigurationError(f"split must be one of {', '.join(specs)}; got {cfg.split!r}")
         spec = specs[cfg.split]
         if cfg.format == "ipa":
-            _check_ipa_camera(spec.camera.camera)
+            big_picture(pinhole(spec.camera.camera))
     layout = Path(cfg.directory) / cfg.format
     target = layout / IPA_SPLITS[cfg.split] / parts.name if cfg.format == "ipa" else layout / parts.name / cfg.split
     with configuring():
@@ -150,13 +151,6 @@ def write_bop_models(folder: Path, parts: Parts) -> None:
             raise ValueError(f"directory must not hold models of other parts, but {target} does: choose another")
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _check_ipa_camera(camera: Any) -> None:
-
-    from attentionvote.datasets.ipa_writer import big_picture
-
-    big_picture(pinhole(camera))
 
 
 def _say(done: int, of: int) -> None:

@@ -103,8 +103,8 @@ class Answering:
             self._took(record, "receive", deadline.elapsed_s())
             served = self.serving.model(name, version)
             served.workers.hold()
-            work = _Work(served, {**job, "most_deadline_ms": limits.most_deadline_ms}, content, deadline, record)
-            future = self.serving.submit(work.run)
+            asked = {**job, "most_deadline_ms": limits.most_deadline_ms}
+            future = self.serving.submit(_worked, served, asked, content, deadline, record, time.monotonic())
         except BaseException:
             admission.leave()
             content.close()
@@ -157,31 +157,22 @@ class Answering:
         self.metrics.seconds.labels(stage).observe(seconds)
 
 
-class _Work:
-    """The part of a request that a thread which asks workers waits for."""
-
-    def __init__(
-        self, served: Served, job: dict[str, Any], content: SharedContent, deadline: Deadline, record: Record
-    ) -> None:
-        self._served, self._job, self._content = served, job, content
-        self._deadline, self._record = deadline, record
-        self._queued = time.monotonic()
-
-    def run(self) -> Message:
-        """Let a worker do it; a Refusal reaches the client."""
-        seconds = self._record.seconds
-        if self._deadline.remaining_s() <= 0:
-            raise too_late(self._deadline, "the request waited in the queue")
-        try:
-            answer = self._served.workers.ask(self._job, self._content, self._deadline)
-        except WorkerLost as loss:
-            raise _lost(loss, self._deadline) from None
-        if answer is None:
-            raise too_late(self._deadline, "a lost worker was replaced")
-        worked: dict[str, float] = answer.head["seconds"]
-        seconds["queue"] = time.monotonic() - self._queued - sum(worked.values())
-        seconds |= worked
-        return answer
+def _worked(
+    served: Served, job: dict[str, Any], content: SharedContent, deadline: Deadline, record: Record, queued: float
+) -> Message:
+    """Let a worker do it, in a thread that waits for it; a Refusal reaches the client."""
+    if deadline.remaining_s() <= 0:
+        raise too_late(deadline, "the request waited in the queue")
+    try:
+        answer = served.workers.ask(job, content, deadline)
+    except WorkerLost as loss:
+        raise _lost(loss, deadline) from None
+    if answer is None:
+        raise too_late(deadline, "a lost worker was replaced")
+    seconds: dict[str, float] = answer.head["seconds"]
+    record.seconds["queue"] = time.monotonic() - queued - sum(seconds.values())
+    record.seconds |= seconds
+    return answer
 
 
 def _lost(loss: WorkerLost, deadline: Deadline) -> Refusal:

@@ -66,7 +66,7 @@ class Metrics:
         # A leak shows here first.
         peak = gauge("peak_memory_bytes", "Highest resident memory of the process so far")
         peak.set_function(lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
-        known: dict[MetricWrapperBase, tuple[str, ...]] = {
+        labels: dict[MetricWrapperBase, tuple[str, ...]] = {
             self.requests: OUTCOMES,
             self.seconds: STAGES,
             self.abstentions: REASONS,
@@ -75,7 +75,7 @@ class Metrics:
             self.connections_closed: CLOSED,
             self.reloads: RELOADS,
         }
-        for metric, values in known.items():
+        for metric, values in labels.items():
             for value in values:
                 metric.labels(value)
 
