@@ -53,7 +53,7 @@ class DatasetSplits:
 
         Raises:
             ValueError: with one sentence, when the folder is no dataset, or of other or several parts, or cannot be
-                split, or the part's frame is not the dataset's.
+                split, nothing tells the parts' points from the bin's, or the part's frame is not the dataset's.
         """
         datasets = _by_split(open_datasets(folder), folder, part)
         names = {split: _scored(dataset) for split, dataset in datasets.items()}
@@ -68,19 +68,10 @@ class DatasetSplits:
                 origins[split] = (
                     f"{whole}, {_range_of(list(dict.fromkeys(map(cycles.dataset.cycle_of, cycles.names))))}"
                 )
-        opened = cls(folder, dict(held_out), {split: splits[split] for split in SPLITS}, origins)
-        opened.check_frame()
-        return opened
-
-    def check_frame(self) -> None:
-        """Whether the points of the first training scene lie on the part's surface; see ``part_frame``.
-
-        Raises:
-            ValueError: with one sentence, also when nothing tells the parts' points from the bin's.
-        """
-        first = self.splits["train"]
-        scene, _ = DatasetSensing(first.dataset, first.part, Sensor("none"), _LOOKED_AT)(first.names[0])
-        check_part_frame(scene, first.part, str(first.dataset.directory), first.dataset.has_labels)
+        train = splits["train"]
+        scene, _ = DatasetSensing(train.dataset, part, Sensor("none"), _LOOKED_AT)(train.names[0])
+        check_part_frame(scene, part, str(train.dataset.directory), train.dataset.has_labels)
+        return cls(folder, dict(held_out), {split: splits[split] for split in SPLITS}, origins)
 
     def __str__(self) -> str:
         return "; ".join(f"{split}: {self.origins[split]}" for split in SPLITS)

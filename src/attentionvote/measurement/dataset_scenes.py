@@ -48,7 +48,8 @@ class DatasetScenes:
         scenes = cls(datasets[0], part, density)
         if not len(scenes):
             raise ValueError(f"{folder} must hold scenes with at least five parts, got {len(datasets[0].names)} others")
-        scenes.check_frame()
+        if scenes.dataset.has_labels:
+            check_part_frame(next(scenes.clouds()), part, str(scenes.dataset.directory), labelled=True)
         return scenes
 
     @cached_property
@@ -103,12 +104,3 @@ class DatasetScenes:
                 np.clip(scene.visible_fraction, 0.0, 1.0),
                 scene.part_ids,
             )
-
-    def check_frame(self) -> None:
-        """Whether the points of the most visible instances of a scene lie on the part's surface at their poses.
-
-        Raises:
-            ValueError: when they do not: mesh and poses are in different frames or units.
-        """
-        if self.dataset.has_labels:
-            check_part_frame(next(self.clouds()), self.part, str(self.dataset.directory), labelled=True)

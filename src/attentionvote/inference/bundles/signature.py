@@ -116,10 +116,7 @@ def load_private_key(path: Path) -> Ed25519PrivateKey:
             f"chmod 600 it, and make a new pair if others may have read it"
         )
 
-    def parse() -> object:
-        return serialization.load_pem_private_key(content, password=None)
-
-    key = _parsed(path, "private", parse)
+    key = _parsed(path, "private", lambda: serialization.load_pem_private_key(content, password=None))
     if not isinstance(key, Ed25519PrivateKey):
         raise BundleError(f"{path} must be an Ed25519 private key, got {type(key).__name__}: make one with `keys`")
     return key
