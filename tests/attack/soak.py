@@ -28,7 +28,7 @@ sys.path[:0] = [str(ROOT / name) for name in ("tests/attack", "tests/fixtures", 
 import numpy as np  # noqa: E402
 from attackers import ATTACKS, child_processes, stopped_workers, swaps  # noqa: E402
 
-from attentionvote.inference.bundles.bundle import write_manifest  # noqa: E402
+from attentionvote.inference.bundles.manifest import write_manifest  # noqa: E402
 from attentionvote.inference.bundles.signature import load_private_key, make_keys  # noqa: E402
 from attentionvote.inference.client import DeadlinePassed, PoseClient, PoseClientError, Unavailable  # noqa: E402
 from attentionvote.workflows.speed.serving import Expected, expectations  # noqa: E402

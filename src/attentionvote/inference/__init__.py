@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from attentionvote.inference.answer import Abstention, Detection, Estimate
-    from attentionvote.inference.bundles.bundle import Bundle, GoldenCloud, load_bundle, write_manifest
+    from attentionvote.inference.bundles.bundle import Bundle, GoldenCloud, load_bundle
+    from attentionvote.inference.bundles.manifest import write_manifest
     from attentionvote.inference.bundles.signature import keys_folder, load_private_key, load_public_key, make_keys
     from attentionvote.inference.cell import Cell, read_cell
     from attentionvote.inference.crop import Crop
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "answer": ("Abstention", "Detection", "Estimate"),
-    "bundles.bundle": ("Bundle", "GoldenCloud", "load_bundle", "write_manifest"),
+    "bundles.bundle": ("Bundle", "GoldenCloud", "load_bundle"),
+    "bundles.manifest": ("write_manifest",),
     "bundles.signature": ("keys_folder", "load_private_key", "load_public_key", "make_keys"),
     "cell": ("Cell", "read_cell"),
     "crop": ("Crop",),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
-from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Detection, Estimate, Reason, detections_from
+from attentionvote.inference.answer import DIGEST_LENGTH, Abstention, Estimate, Reason, detections_from
 from attentionvote.inference.blind_sensor import LEAST_SHARE, BlindSensor
 from attentionvote.inference.bundles.bundle import Bundle, Trusted, load_bundle
 from attentionvote.inference.bundles.signature import PUBLIC_NAME, keys_folder
@@ -26,8 +26,6 @@ from attentionvote.inference.preparation import TooFewPoints, find_neighbors, pr
 from attentionvote.inference.runtime import Session
 from attentionvote.inference.scans.depth_files import CameraIntrinsics
 from attentionvote.inference.scans.limits import MOST_POINTS
-
-__all__ = ["Abstention", "Detection", "Estimate", "InputError", "PoseEstimator"]
 
 
 class PoseEstimator:

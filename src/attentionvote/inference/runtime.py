@@ -23,8 +23,6 @@ import onnxruntime  # type: ignore[import-untyped]
 from attentionvote.contract import FOUND, LAYOUT_KEY, ModelCard, TensorSpec
 from attentionvote.inference.errors import BundleError, DeadlineExceeded
 
-__all__ = ["DeadlineExceeded", "Session", "providers", "runtime_version"]
-
 _ERRORS_ONLY = 3
 _PROVIDERS = {
     "CPU": "CPUExecutionProvider",

@@ -19,7 +19,7 @@ from attentionvote.baselines.opencv import check_opencv
 from attentionvote.baselines.ppf import Detections, PpfDetector
 from attentionvote.baselines.settings import PpfSettings
 from attentionvote.evaluation import SceneResult
-from attentionvote.execution import Executor, WorkerDied, run_all
+from attentionvote.execution import WorkerDied, run_all
 from attentionvote.geometry.pointcloud import estimate_normals
 from attentionvote.part import Part
 from attentionvote.scene import Scene
@@ -63,7 +63,6 @@ def ppf_results(
     scenes: Sequence[Scene],
     settings: PpfSettings | None = None,
     workers: int = 1,
-    executor: Executor | None = None,
     shown: Callable[[Iterator[Any]], Iterable[Any]] = iter,
 ) -> tuple[list[SceneResult], NDArray[np.float64]]:
     """What the baseline finds in every scene, and the seconds ``(S,)`` that each took on one thread.
@@ -75,11 +74,10 @@ def ppf_results(
         scenes: as the sensor gives them; ``data.clouds.sense`` gives what the network's estimator is measured on.
         settings: of the detector.
         workers: processes. The results do not depend on it; the times do where they share cores.
-        executor: where they are; default this machine.
         shown: wraps the scenes as they are done, such as a progress bar.
 
     Raises:
-        ValueError: when OpenCV with its surface matching is missing, or the executor cannot work here.
+        ValueError: when OpenCV with its surface matching is missing.
         OSError: when the worker of one scene died again and again.
     """
     check_opencv()
@@ -87,7 +85,7 @@ def ppf_results(
     scene_results: list[SceneResult | None] = [None] * len(scenes)
     seconds = np.zeros(len(scenes))
     try:
-        with closing(run_all(task, scenes, executor, workers=workers)) as results:
+        with closing(run_all(task, scenes, workers=workers)) as results:
             for index, (detections, elapsed) in shown(results):
                 scene = scenes[index]
                 occlusion = 1.0 - np.minimum(scene.visible_fraction, 1.0)

@@ -26,18 +26,9 @@ from attentionvote.simulation.cycle_pool import run_cycles
 from attentionvote.simulation.drop import Solid
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records
-from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_directory, scene_set_specs
+from attentionvote.simulation.scene_spec import SceneSetSpec
 
 log = logging.getLogger("attentionvote.view")
-
-__all__ = [
-    "SceneSet",
-    "SceneSetSpec",
-    "content_digest",
-    "generate_scene_set",
-    "scene_set_directory",
-    "scene_set_specs",
-]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from attentionvote.contract import VERSION, ModelCard
-from attentionvote.inference.bundles.bundle import load_bundle, write_manifest
+from attentionvote.inference.bundles.bundle import load_bundle
+from attentionvote.inference.bundles.manifest import write_manifest
 from attentionvote.inference.bundles.signature import load_private_key, load_public_key, make_keys
 from attentionvote.inference.errors import BundleError
 

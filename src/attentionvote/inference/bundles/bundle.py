@@ -33,14 +33,11 @@ from attentionvote.inference.bundles.manifest import (
     opened,
     parse_manifest,
     read_file,
-    write_manifest,
 )
 from attentionvote.inference.bundles.signature import load_public_key, verify
 from attentionvote.inference.errors import BundleError
 from attentionvote.inference.scans.array_bytes import arrays_from_npz
 from attentionvote.inference.scans.limits import Budget
-
-__all__ = ["Bundle", "BundleError", "GoldenCloud", "Trusted", "load_bundle", "write_manifest"]
 
 # The key whose signature is demanded, or its file; None checks hashes but no signature.
 Trusted: TypeAlias = Ed25519PublicKey | Path | str | None

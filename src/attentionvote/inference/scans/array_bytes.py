@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.inference.scans.limits import Budget
-from attentionvote.inference.scans.npy_header import NPY_MAGIC, npy_header
+from attentionvote.inference.scans.npy_header import npy_header
 from attentionvote.inference.scans.zip_members import ZIP_MAGIC, unpacked, zip_members
-
-__all__ = ["NPY_MAGIC", "NPZ_MAGIC", "array_from_npy", "arrays_from_npz", "points_from_npz"]
 
 NPZ_MAGIC = ZIP_MAGIC
 _POINTS = "points"

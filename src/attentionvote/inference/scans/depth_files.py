@@ -20,8 +20,6 @@ from attentionvote.inference.scans.other_kinds import other_kind
 from attentionvote.inference.scans.png_depth import PNG_MAGIC, depth_from_png
 from attentionvote.inference.scans.sentences import single_line
 
-__all__ = ["PNG_MAGIC", "CameraIntrinsics", "read_depth"]
-
 # Of an image's pixels: fewer at the largest count may be saturated ones.
 _MISSING_SHARE = 0.02
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from attentionvote.inference.bundles.bundle import load_bundle, write_manifest
+from attentionvote.inference.bundles.bundle import load_bundle
+from attentionvote.inference.bundles.manifest import write_manifest
 from attentionvote.inference.bundles.signature import load_private_key, load_public_key, make_keys
 from attentionvote.inference.fetching.access import Access
 from attentionvote.inference.fetching.bundles import FetchedBundles

@@ -103,7 +103,7 @@ def move_golden(folder: Path, metres: float) -> None:
 
 def sign_again(folder: Path, keys: Path) -> None:
     """Sign a bundle with a key that nobody trusts."""
-    from attentionvote.inference.bundles.bundle import write_manifest
+    from attentionvote.inference.bundles.manifest import write_manifest
 
     write_manifest(folder, load_private_key(make_keys(keys)[0]))
 
