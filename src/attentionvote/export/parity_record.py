@@ -64,10 +64,7 @@ class Parity:
             broken.append(f"scenes must be at least {limits.scenes}, got {self.scenes}")
         if not self.pairs:
             broken.append("at least one detection must be compared, got none: the model finds nothing in these scenes")
-        for name in (
-            "translation_mm", "translation_p99_mm", "rotation_degrees", "rotation_p99_degrees", "confidence",
-            "confidence_p99", "unmatched",
-        ):  # fmt: skip
+        for name in (entry.name for entry in fields(Limits) if entry.name not in ("ap", "scenes")):
             value, limit = getattr(self, name), getattr(limits, name)
             if not value <= limit:
                 scenes = self.unmatched_scenes if name == "unmatched" else (self.worst_scene,)
