@@ -10,6 +10,15 @@ if TYPE_CHECKING:
     from attentionvote.part import Part
     from attentionvote.simulation.symmetry_detection import SymmetryFinding
 
+# What a symmetry of each kind needs to be said.
+_KEYS: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "cyclic": ("axis", "order"),
+    "dihedral": ("axis", "order", "flip_axis"),
+    "revolution": ("axis", "flip"),
+    "group": ("quaternions",),
+}
+
 
 def configuration_text(part: Part, finding: SymmetryFinding, mesh: Path, source: str) -> str:
     """The object's configuration file, every figure with what it is and how it was found."""
@@ -60,16 +69,5 @@ voxel_size: null
 
 
 def _symmetry_settings(part: Part) -> dict[str, Any]:
-    s = part.symmetry
-    settings: dict[str, Any] = {"kind": s.kind}
-    if s.kind in ("cyclic", "dihedral", "revolution"):
-        settings["axis"] = list(s.axis)
-    if s.kind in ("cyclic", "dihedral"):
-        settings["order"] = s.order
-    if s.kind == "dihedral":
-        settings["flip_axis"] = list(s.flip_axis)
-    if s.kind == "revolution":
-        settings["flip"] = s.flip
-    if s.kind == "group":
-        settings["quaternions"] = [list(q) for q in s.quaternions]
-    return settings
+    symmetry = part.symmetry
+    return {"kind": symmetry.kind} | {key: getattr(symmetry, key) for key in _KEYS[symmetry.kind]}
