@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from attentionvote.evaluation import AverageDistance, NearestPointDistance, SceneResult, average_distance, match
+from attentionvote.evaluation import SceneResult, average_distance, match
+from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
 from attentionvote.geometry.pose import apply, rotation_about, transform
 from attentionvote.geometry.symmetry import Symmetry
 

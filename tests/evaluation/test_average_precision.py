@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, score_curve
+from attentionvote.evaluation import PoseMetric, SceneResult, average_precision
 from attentionvote.evaluation.average_precision import summarize
+from attentionvote.evaluation.matching import score_curve
 from attentionvote.geometry.pose import transform
 from attentionvote.geometry.symmetry import Symmetry
 

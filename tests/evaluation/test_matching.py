@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from attentionvote.evaluation import match, score_curve
+from attentionvote.evaluation import match
+from attentionvote.evaluation.matching import score_curve
 
 
 def slow_match(distances, scores, to_find, threshold, lowest=-np.inf):

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 from result_writing import write_ground_truth, write_results
 
-from attentionvote.evaluation import (
-    read_ground_truth,
-    read_results,
-    read_scene_results,
-)
+from attentionvote.evaluation import read_scene_results
+from attentionvote.evaluation.result_files import read_ground_truth, read_results
 
 
 def entry(**change) -> dict:

@@ -8,15 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from attentionvote.evaluation import (
-    NearestPointDistance,
-    PoseMetric,
-    SceneResult,
-    average_precision,
-    curves,
-    evaluate,
-    evaluate_at,
-)
+from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, curves, evaluate, evaluate_at
+from attentionvote.evaluation.average_distance import NearestPointDistance
 from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.geometry.symmetry import Symmetry
 
