@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from attentionvote.inference.errors import InputError
 from attentionvote.inference.scans import pcd_file, ply_file
-from attentionvote.inference.scans.array_bytes import NPY_MAGIC, NPZ_MAGIC, array_from_npy, points_from_npz
+from attentionvote.inference.scans.array_bytes import NPZ_MAGIC, array_from_npy, points_from_npz
 from attentionvote.inference.scans.depth_files import PNG_MAGIC
 from attentionvote.inference.scans.file_bytes import Content, content_view
 from attentionvote.inference.scans.limits import Budget
 from attentionvote.inference.scans.missing_points import cloud_of
+from attentionvote.inference.scans.npy_header import NPY_MAGIC
 from attentionvote.inference.scans.other_kinds import other_kind
 from attentionvote.inference.scans.sentences import single_line
 from attentionvote.inference.scans.text_cloud import points_from_text, text_rows_start

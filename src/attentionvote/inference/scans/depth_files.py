@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry.pointcloud import back_project
 from attentionvote.inference.errors import InputError
-from attentionvote.inference.scans.array_bytes import NPY_MAGIC, array_from_npy
+from attentionvote.inference.scans.array_bytes import array_from_npy
 from attentionvote.inference.scans.camera_figures import check_depth_coding, check_focal_lengths, check_principal_point
 from attentionvote.inference.scans.file_bytes import Content, content_view
 from attentionvote.inference.scans.limits import MOST_PIXELS, Budget
+from attentionvote.inference.scans.npy_header import NPY_MAGIC
 from attentionvote.inference.scans.other_kinds import other_kind
 from attentionvote.inference.scans.png_depth import PNG_MAGIC, depth_from_png
 from attentionvote.inference.scans.sentences import single_line

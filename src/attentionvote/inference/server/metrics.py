@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disable_created_metrics, generate_latest
 from prometheus_client.metrics import MetricWrapperBase
@@ -29,8 +29,9 @@ class Metrics:
     def __init__(self) -> None:
         disable_created_metrics()  # a time beside every counter says nothing here and doubles the page
         self.registry = CollectorRegistry()
-        ours: dict[str, Any] = {"namespace": "attentionvote", "registry": self.registry}
-        counter, gauge, histogram = partial(Counter, **ours), partial(Gauge, **ours), partial(Histogram, **ours)
+        counter = partial(Counter, namespace="attentionvote", registry=self.registry)
+        gauge = partial(Gauge, namespace="attentionvote", registry=self.registry)
+        histogram = partial(Histogram, namespace="attentionvote", registry=self.registry)
         self.requests = counter("requests", "Requests for poses by outcome", ["outcome"])
         self.seconds = histogram("request_seconds", "Seconds of a request by stage", ["stage"], buckets=SECONDS)
         self.waiting = gauge("queue_depth", "Requests admitted and not yet answered, the running one included")
