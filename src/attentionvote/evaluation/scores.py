@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from attentionvote.evaluation.average_distance import AverageDistance, NearestPointDistance
-from attentionvote.evaluation.average_precision import DetectionScores, score_tables
+from attentionvote.evaluation.average_precision import score_tables
 from attentionvote.evaluation.by_part import by_part
 from attentionvote.evaluation.matching import Matching, match
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
@@ -143,33 +143,22 @@ def pose_errors(scenes: Sequence[SceneResult], matchings: Sequence[Matching], pa
     return {"center_error_mm": float(np.median(center_mm)), "rotation_error_deg": float(np.median(rotation))}
 
 
-@dataclass(frozen=True)
-class Curves:
-    """Curves for figures.
+class Curves(NamedTuple):
+    """``thresholds`` ``(T,)`` fractions of D with ``ap`` ``(T,)`` (Fig. 8 of the paper)."""
 
-    ``precision``, ``recall``, ``scores`` ``(K + 1,)``: the mean precision-recall curve at 10 % D, from score
-    +inf (nothing given) down. ``thresholds`` ``(T,)`` fractions of D with ``ap`` ``(T,)`` (Fig. 8 of the paper).
-    """
-
-    precision: Array = field(repr=False)
-    recall: Array = field(repr=False)
-    scores: Array = field(repr=False)
-    thresholds: Array = field(repr=False)
-    ap: Array = field(repr=False)
-    at_10: DetectionScores
+    thresholds: Array
+    ap: Array
 
 
 def curves(scenes: Sequence[SceneResult], part: Part) -> Curves:
-    """Precision-recall curve at 10 % D, and AP against the threshold (0 to 10 % D in steps of half a per cent).
+    """AP against the threshold (0 to 10 % D in steps of half a per cent).
 
     Raises:
         ValueError: when there is no scene.
     """
     tables = distance_tables(scenes, PoseMetric.of(part))
     fractions = np.array([k / 200 for k in range(21)])
-    ap = [score_tables(scenes, tables, t * part.diameter).ap for t in fractions]
-    at_10 = score_tables(scenes, tables, DETAIL_THRESHOLD * part.diameter)
-    return Curves(at_10.curve_precision, at_10.curve_recall, at_10.curve_scores, fractions, np.asarray(ap), at_10)
+    return Curves(fractions, np.array([score_tables(scenes, tables, t * part.diameter).ap for t in fractions]))
 
 
 def ap_by_threshold(scenes: Sequence[SceneResult], part: Parts) -> tuple[Array, Array]:

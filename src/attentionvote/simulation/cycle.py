@@ -43,13 +43,13 @@ def simulate_cycle(
     friction = float(rng.uniform(*spec.drop.friction))
     seeds = dict(zip(spec.drop_counts, scene_seeds, strict=True))
     records = []
-    for pile in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng):
-        count = len(pile.bin_from_part)
+    for bin_from_part in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng):
+        count = len(bin_from_part)
         if count not in seeds:
             continue
         scene_rng = np.random.default_rng(seeds[count])
         camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
-        camera_from_part = camera_from_bin @ pile.bin_from_part
+        camera_from_part = camera_from_bin @ bin_from_part
         surface, dropped_ids = BinSurface(bin_size, camera_from_bin), part_ids[:count]
         records.append(
             SceneRecord(

@@ -8,7 +8,6 @@ with them parts rest 0.2-0.3 % of D inside each other, other solvers and 10 line
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
@@ -22,14 +21,6 @@ from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.mass import Mass, mass_properties
 
 _SMALL_DIAMETER = 0.040  # below it, time step and contact time constant are halved
-
-
-@dataclass(frozen=True, eq=False)
-class Pile:
-    """A settled pile: ``bin_from_part`` ``(k, 4, 4)`` of the first k parts, and the fastest part's speed in m/s."""
-
-    bin_from_part: NDArray[np.float64]
-    speed: float
 
 
 class Solid(NamedTuple):
@@ -46,7 +37,7 @@ def drop_parts(
     friction: float,
     settings: DropSettings,
     rng: np.random.Generator,
-) -> Iterator[Pile]:
+) -> Iterator[NDArray[np.float64]]:
     """Drop parts in sequence and yield every pile that came to rest.
 
     The bin's walls go on invisibly above the rim, as infinite planes: nothing falls out or tunnels through.
@@ -62,7 +53,7 @@ def drop_parts(
         rng: decides places and orientations.
 
     Yields:
-        One :class:`Pile` per accepted drop; its number of parts tells which drop it was.
+        ``bin_from_part`` ``(k, 4, 4)`` of the first k parts, once per accepted drop.
     """
     count = len(part_ids)
     masses = [mass_properties(solid.part) for solid in solids]
@@ -94,7 +85,7 @@ def drop_parts(
                 return
             pile_top = max(pile_top, float(apply(poses_of_part, vertices[i])[..., 2].max()))
         if speed <= 0.05:
-            yield Pile(bin_from_part, speed)
+            yield bin_from_part
 
 
 def _release(
