@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from attentionvote.baselines.opencv import check_opencv
+from attentionvote.baselines.opencv import surface_matching
 from attentionvote.baselines.ppf import PpfDetector
 from attentionvote.baselines.settings import PpfSettings
 from attentionvote.geometry.pointcloud import estimate_normals
@@ -157,7 +157,7 @@ def test_a_missing_opencv_names_the_extra(monkeypatch: pytest.MonkeyPatch, part:
     plain.__version__ = "4.9"  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "cv2", plain)
     with pytest.raises(ValueError, match=r"OpenCV 4.9 here is built without it .*\[benchmark\]"):
-        check_opencv()
+        surface_matching()
 
 
 def test_opencv_keeps_its_threads(voted: PpfDetector, part: Part) -> None:

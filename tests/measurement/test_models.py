@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from attentionvote.data.sensing import CloudSettings, sense
-from attentionvote.evaluation import evaluate
+from attentionvote.evaluation import evaluate, interval
 from attentionvote.inference import PoseEstimator, load_bundle
-from attentionvote.measurement.models import intervals, measure
+from attentionvote.measurement.models import measure
 from attentionvote.measurement.scenes import EvaluationSet
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.sensor import Sensor
@@ -74,7 +74,7 @@ def test_figures_are_of_the_results_and_the_clock(frozen, make_box_model):
     assert measured.seconds.shape == (3,)
     draws = measured.resampled(part, draws=50)
     assert all(values.shape == (50,) for values in draws.values())
-    sure = intervals(draws)["ap_10"]
+    sure = interval(draws["ap_10"])
     assert sure.low <= figures["ap_10"] <= sure.high
 
 

@@ -31,15 +31,6 @@ def surface_matching() -> ModuleType:
     return cv2
 
 
-def check_opencv() -> None:
-    """Whether the baseline can work here, said before any work.
-
-    Raises:
-        ValueError: when OpenCV is missing, or is a build without the contributed modules.
-    """
-    surface_matching()
-
-
 @contextmanager
 def threads(cv2: ModuleType, count: int) -> Iterator[None]:
     """OpenCV on ``count`` threads; what was set before is set again."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.baselines.opencv import check_opencv
+from attentionvote.baselines.opencv import surface_matching
 from attentionvote.baselines.ppf import Detections, PpfDetector
 from attentionvote.baselines.settings import PpfSettings
 from attentionvote.evaluation import SceneResult
@@ -80,7 +80,7 @@ def ppf_results(
         ValueError: when OpenCV with its surface matching is missing.
         OSError: when the worker of one scene died again and again.
     """
-    check_opencv()
+    surface_matching()  # whether it can work here, said before any work
     task = PpfTask(part, settings or PpfSettings())
     scene_results: list[SceneResult | None] = [None] * len(scenes)
     seconds = np.zeros(len(scenes))

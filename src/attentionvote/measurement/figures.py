@@ -11,11 +11,10 @@ if TYPE_CHECKING:
 
 def figures_of(measured: Measurement, part: Parts) -> dict[str, Any]:
     """``figures`` of ``Measurement.figures``; ``intervals``, ``[low, high]`` of 95 % of the draws; AP by threshold."""
-    from attentionvote.evaluation import ap_by_threshold
-    from attentionvote.measurement.models import intervals
+    from attentionvote.evaluation import ap_by_threshold, interval
 
     thresholds, ap = ap_by_threshold(measured.results, part)
-    sure = intervals(measured.resampled(part))
+    sure = {name: interval(draws) for name, draws in measured.resampled(part).items()}
     return {
         "working_point": measured.working_point,
         "figures": {name: round(value, 6) for name, value in measured.figures(part).items()},

@@ -6,19 +6,12 @@ makes its clouds. Several models are measured in one go, scene by scene, so that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from attentionvote.evaluation import (
-    Interval,
-    SceneResult,
-    evaluate_at,
-    interval,
-    resampled_figures,
-    scene_weights,
-)
+from attentionvote.evaluation import SceneResult, evaluate_at, resampled_figures, scene_weights
 from attentionvote.evaluation.scene_result import Array
 from attentionvote.inference import Bundle, Estimate, PoseEstimator
 from attentionvote.measurement.scenes import MeasuredScenes
@@ -53,11 +46,6 @@ class Measurement:
     def resampled(self, part: Parts, draws: int = DRAWS) -> dict[str, Array]:
         """Figures of every bootstrap draw; those of two models on one set belong together draw by draw."""
         return resampled_figures(self.results, part, self.working_point, scene_weights(len(self.results), draws))
-
-
-def intervals(resampled: Mapping[str, Array]) -> dict[str, Interval]:
-    """The 95 % interval of every resampled figure."""
-    return {name: interval(draws) for name, draws in resampled.items()}
 
 
 def measure(
