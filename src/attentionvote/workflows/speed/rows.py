@@ -9,25 +9,16 @@ from attentionvote.workflows.speed.contest import Goal, Row
 COMPACT, FULL = "compact", "full"
 EAGER, CONV, CDIST = "plain torch", "Conv2d and BatchNorm", "torch cdist"
 QUICKFPS, OPEN3D, GRAPH = "torch-quickfps", "Open3D", "the graph alone"
+_CDIST_GOAL = ">= 20 x faster than torch cdist"
 
 ROWS: tuple[Row, ...] = (
-    Row(
-        "farthest-points",
-        "farthest-point order",
-        "points:farthest_points",
-        (Goal("<= 1.2 x torch-quickfps", 1.2, QUICKFPS),),
-    ),
-    Row(
-        "ball-query",
-        "first-k ball query, four levels",
-        "points:ball_queries",
-        (Goal(">= 20 x faster than torch cdist", 1 / 20, CDIST),),
-    ),
-    Row(
-        "normals",
-        "normals of 30 neighbours",
-        "points:normals",
-        (Goal("<= 1.3 x Open3D", 1.3, OPEN3D),),
+    *(
+        Row(name, title, f"points:{prepare}", (Goal(text, most, against),))
+        for name, title, prepare, text, most, against in (
+            ("farthest-points", "farthest-point order", "farthest_points", "<= 1.2 x torch-quickfps", 1.2, QUICKFPS),
+            ("ball-query", "first-k ball query, four levels", "ball_queries", _CDIST_GOAL, 1 / 20, CDIST),
+            ("normals", "normals of 30 neighbours", "normals", "<= 1.3 x Open3D", 1.3, OPEN3D),
+        )
     ),
     *(
         Row(
@@ -92,44 +83,21 @@ ROWS: tuple[Row, ...] = (
         )
         for size in (COMPACT, FULL)
     ),
-    Row(
-        "growth-points",
-        "the whole cost as N grows: no worse than N log N",
-        "growth:points",
+    *(
+        Row(f"growth-{name}", f"the whole cost as {grows}: no worse than {bound}", f"growth:{name}")
+        for name, grows, bound in (
+            ("points", "N grows", "N log N"),
+            ("instances", "instances grow", "N log N"),
+            ("proposals", "K grows", "K log K"),
+        )
     ),
-    Row(
-        "growth-instances",
-        "the whole cost as instances grow: no worse than N log N",
-        "growth:instances",
-    ),
-    Row(
-        "growth-proposals",
-        "the whole cost as K grows: no worse than K log K",
-        "growth:proposals",
-    ),
-    Row(
-        "gpu-training",
-        "a training step, full, data on the GPU",
-        "gpu:training",
-        (Goal(">= 1,000 scenes/s", 1.0),),
-        "scene",
-        cuda=True,
-    ),
-    Row(
-        "gpu-inference",
-        "one scene, order computed",
-        "gpu:inference",
-        (Goal("<= 5 ms", 5.0),),
-        "cloud",
-        cuda=True,
-    ),
-    Row(
-        "gpu-champion",
-        "from CAD to champion",
-        "gpu:champion",
-        (Goal("<= 30 min", 1.8e6),),
-        "part",
-        cuda=True,
+    *(
+        Row(f"gpu-{name}", title, f"gpu:{name}", (Goal(text, most),), item, cuda=True)
+        for name, title, text, most, item in (
+            ("training", "a training step, full, data on the GPU", ">= 1,000 scenes/s", 1.0, "scene"),
+            ("inference", "one scene, order computed", "<= 5 ms", 5.0, "cloud"),
+            ("champion", "from CAD to champion", "<= 30 min", 1.8e6, "part"),
+        )
     ),
 )
 
