@@ -9,8 +9,6 @@ what is done is not done again. With executor=ray or executor=slurm the parts go
 
 from __future__ import annotations
 
-import sys
-
 from attentionvote.command.configuration import compose
 from attentionvote.command.entry import command
 from attentionvote.workflows.fleet.job import run
@@ -18,11 +16,4 @@ from attentionvote.workflows.fleet.settings import FleetSettings
 from attentionvote.workflows.train.preset import preset_of_workers
 
 if __name__ == "__main__":
-    preset: list[str] = []
-
-    def presets(words: list[str]) -> list[str]:
-        """The preset of the trainings, chosen and said once."""
-        preset[:] = preset_of_workers(compose(FleetSettings, words), words)
-        return preset
-
-    command(FleetSettings, lambda cfg: run(cfg, [*preset, *sys.argv[1:]]), defaults=presets)
+    command(FleetSettings, run, defaults=lambda words: preset_of_workers(compose(FleetSettings, words), words))

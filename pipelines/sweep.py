@@ -22,20 +22,19 @@ from attentionvote.workflows.train.preset import preset_of_workers
 _WHERE = ("executor", "cluster")  # settings that say where trials run
 
 
-def run(cfg: SweepSettings, words: Sequence[str]) -> dict[str, Any]:
+def run(cfg: SweepSettings) -> dict[str, Any]:
     """Bring the study to its total; its best trial.
 
     Args:
-        cfg: the sweep's configuration.
-        words: it was composed of, the machine's default included; those of the training are handed on to the trials.
+        cfg: the sweep's configuration, whose words about the training are handed on to the trials.
     """
     from attentionvote.files import locked_folder
     from attentionvote.workflows.sweep.job import SweepJob
     from attentionvote.workflows.sweep.report import check_save_as
 
-    check_save_as(cfg.save_as, words=words)
+    check_save_as(cfg.save_as, words=cfg.words)
     with configuring():
-        job = SweepJob(cfg, training_words(words), _space_name(words))
+        job = SweepJob(cfg, training_words(cfg.words), _space_name(cfg.words))
     with locked_folder(job.folder, cfg.sweeps, "sweep", "sweeps"):
         with configuring():
             job.open()
@@ -66,17 +65,5 @@ def check(cfg: SweepSettings) -> None:
     parse_space(cfg.composed["sweep"]["space"], cfg)
 
 
-def main() -> None:
-    """The verb; its trials need the words as they were said."""
-    composed_words: list[str] = []
-
-    def defaults(words: list[str]) -> list[str]:
-        machine = preset_of_trials(words)
-        composed_words[:] = [*machine, *words]
-        return machine
-
-    command(SweepSettings, lambda cfg: run(cfg, composed_words), defaults=defaults, check=check)
-
-
 if __name__ == "__main__":
-    main()
+    command(SweepSettings, run, defaults=preset_of_trials, check=check)

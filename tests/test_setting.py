@@ -185,8 +185,8 @@ def test_targets_of_a_users_own_are_called_as_they_are() -> None:
 
 
 def test_a_section_that_does_not_fit_together_is_named_in_full() -> None:
-    with pytest.raises(SettingError, match=r"^model.head must have at least one width; got \[\]$"):
-        read(Network, {"model": SMALL | {"head": []}})
+    with pytest.raises(SettingError, match=r"^model.centers must have 4 entries, one a level; got \[3\]$"):
+        read(Network, {"model": SMALL | {"centers": [3]}})
 
 
 def test_choices_that_take_seconds_to_import_are_looked_up_for_others_alone() -> None:

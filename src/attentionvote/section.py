@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, Self, TypeVar, get_args, get_origin
 
 from attentionvote.setting import (
     Field,
@@ -35,7 +35,7 @@ def find(section: Any, key: str, values: Any = None) -> Field | None:
     for name in key.split("."):
         type_, _ = without_null(field.type)
         inside = isinstance(values, Mapping)
-        if type_ is Target:
+        if is_target(type_):
             if not inside or "_target_" not in values:
                 return None
             type_ = located(str(values["_target_"]))
@@ -61,9 +61,10 @@ class Target:
 
     path: str
     arguments: Mapping[str, Any]
+    given: ClassVar[int] = 0  # parameters, the first ones, that whoever calls it fills
 
     @classmethod
-    def of(cls, values: Mapping[str, Any], key: str = "") -> Target:
+    def of(cls, values: Mapping[str, Any], key: str = "") -> Self:
         """A section of plain values, checked against the signature of its target.
 
         Raises:
@@ -74,16 +75,16 @@ class Target:
                 f"{key or 'a section'} must have _target_, the dotted name of what it configures; got none"
             )
         for name in ("_args_", "_partial_"):
-            if name in values:
+            if name in values and not (cls.given and values[name] is True):
                 raise SettingError(f"{key or 'a section'} takes its arguments by name, got {name}: leave it out")
         # _recursive_ and _convert_ steer Hydra's own way of calling a target.
         arguments = {str(name): item for name, item in values.items() if not str(name).startswith("_")}
         path = str(values["_target_"])
-        _arguments(located(path), arguments, key)
+        _arguments(located(path), arguments, key, cls.given)
         if values.get("_recursive_", True):
             for name, item in arguments.items():
                 if isinstance(item, Mapping) and "_target_" in item:
-                    arguments[name] = cls.of(item, f"{key}.{name}" if key else name)
+                    arguments[name] = Target.of(item, f"{key}.{name}" if key else name)
         return cls(path, arguments)
 
     @property
@@ -91,10 +92,35 @@ class Target:
         """The argument ``name``."""
         return str(self.arguments["name"])
 
-    def __call__(self) -> Any:
-        """What the section configures; errors are those of its target."""
+    @property
+    def parameters(self) -> Collection[str]:
+        """What the target can be given by name."""
+        return fields_of(located(self.path)).keys()
+
+    def __call__(self, *first: Any, **more: Any) -> Any:
+        """What the section configures; errors are those of its target.
+
+        Args:
+            first: a factory's first arguments.
+            more: arguments for those that the section leaves out.
+        """
         made = {name: item() if isinstance(item, Target) else item for name, item in self.arguments.items()}
-        return located(self.path)(**made)
+        return located(self.path)(*first, **{**more, **made})
+
+
+@dataclasses.dataclass(frozen=True)
+class Factory(Target):
+    """A section whose target is given its first argument when it is called: an optimizer the weights, for one.
+
+    ``_partial_: true``, which Hydra wants there, may stand in it.
+    """
+
+    given: ClassVar[int] = 1
+
+
+def is_target(type_: Any) -> bool:
+    """Whether a setting of this type is a section with ``_target_``."""
+    return isinstance(type_, type) and issubclass(type_, Target)
 
 
 def located(path: str) -> Any:
@@ -161,9 +187,10 @@ def check(section: Any) -> None:
             _value(name, value, field.type, field.setting)
 
 
-def _arguments(section: Any, values: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _arguments(section: Any, values: Mapping[str, Any], key: str, given: int = 0) -> dict[str, Any]:
+    """The values of a section; the first ``given`` of its fields are none of them."""
     try:
-        fields, takes_any = fields_of(section), takes_any_name(section)
+        fields, takes_any = dict(list(fields_of(section).items())[given:]), takes_any_name(section)
     except ValueError as error:  # of a builtin, which tells nothing of its arguments
         raise SettingError(f"_target_ must be a class or function with a signature; got {section!r}") from error
     arguments = {}
@@ -192,13 +219,15 @@ def _value(key: str, value: Any, type_: Any, setting: Setting) -> Any:
             return None
         raise SettingError(f"{key} must be {wanted(type_, setting, True)}; got null")
     if type_ is Any:
+        if setting.problem is not None and (problem := setting.problem(value)):
+            raise SettingError(f"{key} {problem}")
         return value
     origin = get_origin(type_)
     if dataclasses.is_dataclass(type_):
         if not isinstance(value, Mapping):
             raise SettingError(f"{key} must be a section{' or null' if nullable else ''}; got {value!r}")
-        if type_ is Target:
-            return Target.of(value, key)
+        if is_target(type_):
+            return type_.of(value, key)  # type: ignore[union-attr]
         return read(type_, value, key)  # type: ignore[arg-type]
     if origin in (dict, Mapping):
         if not isinstance(value, Mapping):
@@ -207,6 +236,8 @@ def _value(key: str, value: Any, type_: Any, setting: Setting) -> Any:
     if origin in (tuple, Sequence, list):
         if isinstance(value, str) or not isinstance(value, Sequence):
             raise SettingError(f"{key} must be a list{' or null' if nullable else ''}; got {value!r}")
+        if not (value or setting.empty):
+            raise SettingError(f"{key} must not be an empty list")
         inner = get_args(type_)
         types_ = [inner[0]] * len(value) if len(inner) == 1 or inner[1] is ... else list(inner)
         if len(types_) != len(value):
@@ -225,7 +256,7 @@ def leaves(section: Any, key: str = "") -> Iterator[tuple[str, Field]]:
     for name, field in fields_of(section).items():
         inner = f"{key}.{name}" if key else name
         type_, _ = without_null(field.type)
-        if dataclasses.is_dataclass(type_) and type_ is not Target:
+        if dataclasses.is_dataclass(type_) and not is_target(type_):
             yield from leaves(type_, inner)
         else:
             yield inner, field

@@ -17,6 +17,7 @@ import math
 import types
 from collections.abc import Callable, Collection
 from difflib import get_close_matches
+from enum import Enum
 from functools import cache
 from importlib import import_module
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -47,6 +48,19 @@ class ChoicesOf:
         return tuple(getattr(import_module(self.module), self.name))
 
 
+class Identity(Enum):
+    """Whether a setting is part of what identifies a result, a training say.
+
+    Attributes:
+        ALWAYS: another value is another result.
+        CHANGED: it is, but at its default it is left out, so that it makes no difference to results of before it came.
+        NEVER: it says how the work is done, and nothing about what comes of it.
+        ONCE: it is none any more; results of when it was are still recognised.
+    """
+
+    ALWAYS, CHANGED, NEVER, ONCE = range(4)
+
+
 @dataclasses.dataclass(frozen=True)
 class Setting:
     """What one setting means and may be.
@@ -56,6 +70,8 @@ class Setting:
         low, high: inclusive bounds of its numbers.
         above: exclusive lower bound.
         choices: the texts that are allowed.
+        empty: whether a list may be empty.
+        identity: whether it is part of what identifies a result.
         problem: what else may be wrong with a value: a sentence's end after the setting's name, or an empty string.
     """
 
@@ -64,6 +80,8 @@ class Setting:
     high: float = math.inf
     above: float = -math.inf
     choices: tuple[str, ...] | ChoicesOf = ()
+    empty: bool = False
+    identity: Identity = Identity.ALWAYS
     problem: Callable[[Any], str] | None = None
 
     def range_text(self) -> str:
@@ -94,17 +112,17 @@ def fields_of(section: Any) -> dict[str, Field]:
 
 @cache
 def _fields_of(section: Any) -> dict[str, Field]:
+    plain_class = isinstance(section, type) and not dataclasses.is_dataclass(section)
     try:
-        hints = get_type_hints(section, include_extras=True)
+        hints = get_type_hints(section.__init__ if plain_class else section, include_extras=True)
     except NameError:  # a function of the user's, annotated with names that are imported for type checks alone
         hints = {}
     if dataclasses.is_dataclass(section):
         missing = dataclasses.MISSING
-        entries = [
-            (f.name, ... if f.default is missing and f.default_factory is missing else f.default)
-            for f in dataclasses.fields(section)
-            if f.init
-        ]
+        entries = []
+        for f in dataclasses.fields(section):
+            default = f.default if f.default_factory is missing else f.default_factory()
+            entries += [(f.name, ... if default is missing else default)] if f.init else []
     else:
         parameters = [p for p in inspect.signature(section).parameters.values() if p.kind not in _VARIABLE]
         entries = [(p.name, ... if p.default is inspect.Parameter.empty else p.default) for p in parameters]
@@ -150,7 +168,8 @@ def scalar_problem(value: Any, type_: Any, setting: Setting, nullable: bool) -> 
         float: number,
         str: isinstance(value, str),
     }
-    if not fits[type_]:
+    types_ = get_args(type_) if get_origin(type_) in (Union, types.UnionType) else (type_,)
+    if not any(fits[one] for one in types_):
         return f"{wanted(type_, setting, True)}; got {value!r}"
     if not number or (math.isfinite(value) and setting.low <= value <= setting.high and value > setting.above):
         return ""
@@ -163,6 +182,10 @@ def wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
         return f"one of {', '.join(map(str, get_args(type_)))}"
     if setting.choices:
         return setting.range_text()
+    if get_origin(type_) in (Union, types.UnionType):
+        return " or ".join(
+            wanted(member, setting if member in (int, float) else Setting(""), True) for member in get_args(type_)
+        )
     if not isinstance(type_, type) or type_ not in _NOUNS:
         return "a section" if dataclasses.is_dataclass(type_) else setting.range_text() or "a list"
     bounds = setting.range_text()

@@ -95,7 +95,11 @@ def test_the_machines_default_is_weaker_than_the_users_word(verb: Path) -> None:
     ("words", "code", "expected"),
     [
         (["object=gaer"], 2, "fake: object must be one of gear; got 'gaer', did you mean 'gear'?"),
-        (["object=gear", "trainer.lr=abc"], 2, "fake: trainer.lr must be a finite number such as 0.001; got 'abc'"),
+        (
+            ["object=gear", "trainer.lr=abc"],
+            2,
+            "fake: trainer.lr must be a number greater than 0 and at most 10; got 'abc'",
+        ),
         (["object=gear", "do=mesh"], 2, "fake: object gear: file not found: nowhere.stl"),
         (["object=gear", "do=lightning"], 130, "fake: interrupted; run the same command to resume"),
         (["object=gear", "do=bad data"], 1, "fake: the cloud must be finite, got 3 NaN (details in outputs/logs/"),

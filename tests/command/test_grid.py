@@ -10,13 +10,14 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import warm_starter
 
+from attentionvote.command.configuration import compose
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect, resolve_store
+from attentionvote.workflows.train.settings import TrainSettings
 
 SCRIPT = '''
 """A verb that does what it is told."""
@@ -99,7 +100,7 @@ def test_a_grid_runs_job_by_job_without_folders_of_its_own(verb: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["trainer.lr=0.1,abc"], "trainer.lr must be a finite number such as 0.001; got 'abc'"),
+        (["trainer.lr=0.1,abc"], "trainer.lr must be a number greater than 0 and at most 10; got 'abc'"),
         (["trainer.lr=0.1,6"], "object gear: lr must be small here, got 6"),
         (["trainer.lr=0.1,0.2", "hydra.sweep.dir=x"], "takes no settings of Hydra itself, got 'hydra.sweep.dir=x'"),
     ],
@@ -220,8 +221,7 @@ def test_the_parent_of_one_part_lives_with_its_runs(put_tables: Callable[[Path],
     from attentionvote.command import grid as multirun
 
     store = put_tables(tmp_path / "mlflow.db")
-    settings = {"object": {"name": "gear"}, "tracking": {"store": store, "parent": None}}
-    jobs = [SimpleNamespace(composed={**settings, "lr": lr}) for lr in (1, 2)]
+    jobs = [compose(TrainSettings, ["object=gear", f"tracking.store={store}", f"seed={seed}"]) for seed in (1, 2)]
     opened = []
     for chosen in (jobs, jobs[:1], list(reversed(jobs))):
         run = multirun._open_parent("train", "lr=1,2", [["lr=1"], ["lr=2"]], chosen)

@@ -23,8 +23,8 @@ from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
 VERBS = sorted(path.stem for path in CONF.glob("*.yaml"))
-# Symmetries and other things that their own code checks.
-UNTYPED = ("object.symmetry", "object.parts", "table.", "sweep.space", "evaluation.frozen")
+# Symmetries, arguments of Lightning's and other things that their own code checks.
+UNTYPED = ("object.symmetry", "object.parts", "callbacks.", "loggers.", "table.", "sweep.space", "evaluation.frozen")
 
 
 @cache
@@ -116,18 +116,27 @@ def test_every_number_has_bounds_on_both_sides_and_beyond_them_a_sentence(verb: 
         ("model.fusion_kind=amk",
          f"model.fusion_kind must be one of {', '.join(FUSIONS)}; got 'amk', did you mean 'amx'?"),
         # What Hydra's grammar adds or takes away.
-        ("+trainer.accumulate_grad_batches=2", "there is no setting 'trainer.accumulate_grad_batches'"),
+        ("+trainer.accumulate_grad_batch=2",
+         "there is no setting 'trainer.accumulate_grad_batch', did you mean 'trainer.accumulate_grad_batches'?"),
+        ("trainer.limit_val_batches=1.5",
+         "trainer.limit_val_batches must be a share of at most 1.0, or a whole number of batches; got 1.5"),
+        ("trainer.fast_dev_run=few",
+         "trainer.fast_dev_run must be true or false or a whole number at least 0 and at most 100000; got 'few'"),
+        ("callbacks.stop.patience=3",
+         "callbacks.stop must have _target_, the dotted name of what it configures; got none"),
+        ("callbacks.stop._target_=lightning.Stopp",
+         "_target_ must be the dotted name of a class or function; got 'lightning.Stopp': module 'lightning' has no "
+         "attribute 'Stopp'"),
+        ("optimizer._target_=torch.optim.lr_scheduler.StepLR", "optimizer.step_size must be given"),
         ("~trainer.schedule", "trainer.schedule must be given"),
         ("+data.sensor.edge_dropout=2", "data.sensor.edge_dropout must be at least 0 and at most 1; got 2"),
         ("object.diameter=-1", "object.diameter must be a number greater than 0 and at most 10; got -1"),
         ("+object.colour=red", "there is no setting 'object.colour'"),
-        ("data.sensor.edge_dropout=0.2",
-         "data.sensor.edge_dropout is not in conf/, so it is added: +data.sensor.edge_dropout=0.2"),
         ("~model.classes", "model.classes can be changed, not taken away, got '~model.classes': give it a value"),
         ("+model._target_=mine.Network",
          "model._target_ must be left out or attentionvote.model.AttentionVote; got 'mine.Network'"),
         ("model.centers=[512,256]", "model.centers must have 4 entries, one a level; got [512, 256]"),
-        ("object.symmetry=3", "object.symmetry must be a section with keys kind, axis, flip; got 3"),
+        ("object.symmetry=3", "object.symmetry must be a section with keys kind, axis, order, flip, flip_axis, quaternions; got 3"),
     ],
 )  # fmt: skip
 def test_an_impossible_value_is_one_sentence(words: str, sentence: str) -> None:
@@ -156,7 +165,7 @@ def test_help_says_type_range_and_meaning_of_every_setting() -> None:
         "[one of metric, slerp, minra, nlerp]",
         "  workers=null\n      Processes for generation and clouds; null = one per core of this machine. "
         "[a whole number at least 1 and at most 1024]",
-        "  +data.sensor.dropout=0.01\n      phoxi: share of points lost anywhere. [a number at least 0 and at most 1]",
+        "  data.sensor.dropout=0.01\n      phoxi: share of points lost anywhere. [a number at least 0 and at most 1]",
     ):
         assert line in text
     assert text.count("splits never share a cycle") == 1

@@ -5,14 +5,12 @@ with the nearest valid name, before any work starts:
 
 * a group choice that does not exist (``object=conecting_rod``) or a group that must be chosen;
 * a setting that does not exist (``trainer.max_epoch=3``, ``lr=1``);
-* a value of another type than the default it replaces (``trainer.learning_rate=abc``);
-* a value outside its range (on its field, see ``setting.py``);
+* a value of another type (``trainer.learning_rate=abc``) or outside its range (on its field, see ``setting.py``);
 * an interpolation or a mandatory value that cannot be resolved.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -27,11 +25,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
-from attentionvote.command.conf_folder import CONF, choices, groups
+from attentionvote.command.conf_folder import CONF, choices, files, folders, groups, is_group, primary_file
 from attentionvote.command.errors import ConfigurationError, nearest, sentence
 from attentionvote.command.words import parse
 from attentionvote.section import find, read
-from attentionvote.setting import SettingError, without_null
+from attentionvote.section import leaves as fields_below
+from attentionvote.setting import SettingError
 
 
 def leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -50,10 +49,12 @@ class VerbSettings:
     Attributes:
         verb: stem of the configuration file.
         composed: plain containers as Hydra composed them, every interpolation resolved: what identities are made of.
+        words: they were composed of.
     """
 
     verb: ClassVar[str]
     composed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    words: tuple[str, ...] = field(default=(), init=False, repr=False, compare=False)
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:
@@ -74,49 +75,68 @@ class VerbSettings:
 Settings = TypeVar("Settings", bound=VerbSettings)
 
 
-def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CONF) -> Settings:
+def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CONF, name: str | None = None) -> Settings:
     """The checked settings of a verb with ``overrides``, every interpolation resolved.
+
+    Hydra's grammar holds, but one rule is easier: a setting that has a default and is not in ``conf/`` is set with or
+    without ``+``.
+
+    Args:
+        settings: of the verb.
+        overrides: words of Hydra's grammar.
+        conf: folder of the configuration files; the user's stands beside it.
+        name: of the configuration to begin with, else the verb's.
 
     Raises:
         ConfigurationError: with one sentence, see the module's docstring.
     """
-    verb = settings.verb
+    name = name or settings.verb
+    primary_file(name, conf)
     parsed = parse(overrides)
-    group_words = [o for o in parsed if o.input_line and (conf / o.key_or_group).is_dir()]
+    for override in parsed:
+        if override.key_or_group.split("/")[0].split(".")[0] == "hydra":
+            raise ConfigurationError(
+                f"settings of Hydra itself have no effect, got {override.input_line!r}: leave it out (a verb runs its "
+                "own work, and says where it puts things)"
+            )
+    group_words = [o for o in parsed if o.input_line and is_group(o.key_or_group, conf)]
     for override in group_words:
         _check_choice(override, conf)
-    values = [o for o in parsed if o not in group_words and o.key_or_group.split("/")[0].split(".")[0] != "hydra"]
-    if values:
-        base = _defaults(verb, tuple(str(o.input_line) for o in parsed if o not in values), conf, _state(conf))
-        for override in values:
-            _check_key(settings, override, base, conf)
-    final = _plain(_compose(verb, overrides, conf))
-    for override in values:
-        key = override.key_or_group
-        if not (override.is_add() or override.is_force_add() or override.is_delete()):
-            check_types(settings, key, _select(base, key), _final_value(final, override), base)
+    words = list(overrides)
+    if len(group_words) < len(parsed):
+        base = _defaults(name, tuple(str(o.input_line) for o in group_words), conf, _state(conf))
+        for index, override in enumerate(parsed):
+            added = override.is_add() or override.is_force_add()
+            if override not in group_words and not added and _is_left_out(settings, override, base, conf):
+                words[index] = f"++{override.input_line}"
     try:
-        return settings.of(final)
+        checked = settings.of(_plain(_compose(name, words, conf)))
     except SettingError as error:
         raise ConfigurationError(sentence(error)) from error
+    object.__setattr__(checked, "words", tuple(overrides))
+    return checked
 
 
 @lru_cache(maxsize=64)
-def _defaults(verb: str, group_words: tuple[str, ...], conf: Path, _: object) -> dict[str, Any]:
+def _defaults(name: str, group_words: tuple[str, ...], conf: Path, _: object) -> dict[str, Any]:
     """What the values replace, not to be changed: a third of a second that a fleet of parts or a sweep pays once."""
-    return _plain(_compose(verb, group_words, conf))
+    return _plain(_compose(name, group_words, conf))
 
 
 def _state(conf: Path) -> tuple[tuple[str, int, int], ...]:
     """What tells that a file of the configuration has changed, as a part does that is added."""
-    stats = ((path, path.stat()) for path in sorted(conf.rglob("*.yaml")))
+    paths = [folder / file for folder in folders(conf) for file in files(folder)]
+    stats = ((path, path.stat()) for path in paths)
     return tuple((str(path), facts.st_mtime_ns, facts.st_size) for path, facts in stats)
 
 
-def _compose(verb: str, overrides: Sequence[str], conf: Path) -> DictConfig:
+def _compose(name: str, overrides: Sequence[str], conf: Path) -> DictConfig:
+    primary = primary_file(name, conf)
+    beside = [folder for folder in folders(conf) if folder != primary.parent]
+    search = [f"hydra.searchpath=[{','.join(map(_quoted, beside))}]"] if beside else []
     try:
-        with initialize_config_dir(str(conf), version_base="1.3", job_name=verb):
-            return hydra_compose(verb, list(overrides))
+        with initialize_config_dir(str(primary.parent), version_base="1.3", job_name=name):
+            return hydra_compose(name, [*search, *overrides])
     except MissingConfigException as error:
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
         if group and (conf / group).is_dir():
@@ -130,6 +150,12 @@ def _compose(verb: str, overrides: Sequence[str], conf: Path) -> DictConfig:
         raise ConfigurationError(text) from error
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigurationError(sentence(error)) from error
+
+
+def _quoted(folder: Path) -> str:
+    """A folder as Hydra's grammar takes any text."""
+    text = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'file://{text}'"
 
 
 def _plain(cfg: DictConfig) -> dict[str, Any]:
@@ -162,22 +188,33 @@ def _check_choice(override: Override, conf: Path) -> None:
             raise ConfigurationError(_choice_problem(override.key_or_group, shown, conf))
 
 
-def _check_key(settings: type[VerbSettings], override: Override, base: dict[str, Any], conf: Path) -> None:
+def _is_left_out(settings: type[VerbSettings], override: Override, base: dict[str, Any], conf: Path) -> bool:
+    """Whether a word sets something that has a default and is not in the configuration.
+
+    Raises:
+        ConfigurationError: there is no such setting, or it cannot be taken away.
+    """
     key = override.key_or_group
-    if override.is_add() or override.is_force_add():
-        return
     field = find(settings, key, base)
     if override.is_delete() and field is not None and field.default is not ...:
         raise ConfigurationError(f"{key} can be changed, not taken away, got {override.input_line!r}: give it a value")
     try:
         _select(base, key)
+        return False
     except KeyError:
-        if field is not None and field.default is not ...:
-            raise ConfigurationError(f"{key} is not in conf/, so it is added: +{override.input_line}") from None
-        keys = [k for k, _ in leaves(base)]
+        if not override.is_delete() and _has_default(settings, key, base):
+            return True
+        keys = [k for k, _ in leaves(base)] + [k for k, f in fields_below(settings) if f.default is not ...]
         sections = {k.rsplit(".", n)[0] for k in keys for n in range(1, k.count(".") + 1)}
-        hint = nearest(key, [*(g for g in groups(conf) if "." not in key), *keys, *sorted(sections)])
+        hint = nearest(key, [*(g for g in groups(conf) if "." not in key), *dict.fromkeys(keys), *sorted(sections)])
         raise ConfigurationError(f"there is no setting {key!r}{hint}") from None
+
+
+def _has_default(settings: type[VerbSettings], key: str, base: Mapping[str, Any]) -> bool:
+    """Whether a setting, or an open section that it lies in, has a default."""
+    names = key.split(".")
+    above = [find(settings, ".".join(names[: count + 1]), base) for count in range(len(names))]
+    return any(field is not None and field.default is not ... for field in above)
 
 
 def _select(plain: Any, key: str) -> Any:
@@ -190,66 +227,3 @@ def _select(plain: Any, key: str) -> Any:
         else:
             raise KeyError(key)
     return node
-
-
-def _final_value(final: dict[str, Any], override: Override) -> Any:
-    """The value that an override has in the end."""
-    try:
-        return _select(final, override.key_or_group)
-    except KeyError:
-        raise ConfigurationError(
-            f"{override.input_line} must stay in the configuration, but another word takes its section away: leave one "
-            "of them out"
-        ) from None
-
-
-def check_types(
-    settings: type[VerbSettings], key: str, default: Any, value: Any, values: Mapping[str, Any] | None = None
-) -> None:
-    """Refuse ``value`` where it has another type than ``default``, with the default as an example.
-
-    Null is left to the setting's own type, on both sides.
-
-    Args:
-        values: of the settings, see ``section.find``.
-    """
-    setting = find(settings, key, values)
-    nullable = setting is not None and without_null(setting.type)[1]
-    if default is None or (value is None and nullable):
-        return
-    if isinstance(default, Mapping):
-        if not isinstance(value, Mapping):
-            names = ", ".join(map(str, default))
-            raise ConfigurationError(f"{key} must be a section with keys {names}; got {_shown(value)}")
-        for name in value:
-            if name in default:
-                check_types(settings, f"{key}.{name}", default[name], value[name], values)
-        return
-    if isinstance(default, list):
-        if not isinstance(value, list):
-            raise ConfigurationError(f"{key} must be a list such as {default}; got {_shown(value)}")
-        if default and not value:
-            raise ConfigurationError(f"{key} must not be empty, a list such as {default}; got []")
-        for index, item in enumerate(value if default else ()):
-            check_types(settings, f"{key}[{index}]", default[min(index, len(default) - 1)], item, values)
-        return
-    problem = type_problem(default, value)
-    if problem:
-        example = f" such as {default}" if default != "" else ""
-        raise ConfigurationError(f"{key} must be {problem}{example}; got {_shown(value)}")
-
-
-def _shown(value: Any) -> str:
-    return "null" if value is None else repr(value)
-
-
-def type_problem(default: object, value: object) -> str:
-    """What ``value`` should have been to replace ``default``, or an empty string when it fits."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if isinstance(default, bool):
-        return "" if isinstance(value, bool) else "true or false,"
-    if isinstance(default, int):
-        return "" if number and not isinstance(value, float) else "a whole number"
-    if isinstance(default, float):
-        return "" if number and math.isfinite(float(value)) else "a finite number"  # type: ignore[arg-type]
-    return "" if isinstance(value, str) else "a text"

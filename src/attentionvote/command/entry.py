@@ -25,9 +25,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from omegaconf import DictConfig, OmegaConf
-
-from attentionvote.command.conf_folder import CONF
+from attentionvote.command.command_line import command_line
+from attentionvote.command.conf_folder import CONF, add_folder, folders, primary_file, see_modules
 from attentionvote.command.configuration import Settings, compose
 from attentionvote.command.errors import ConfigurationError, Refused, sentence
 from attentionvote.command.grid import run_grid
@@ -61,22 +60,28 @@ def command(
         check: raises when a configuration cannot work, before the first job of a grid starts; ``run`` checks its own.
         conf: folder of the configuration files.
     """
-    verb, words = settings.verb, sys.argv[1:]
+    verb = settings.verb
     join_starter()
     _log_to_stderr()
-    if any(word in ("-h", "--help") for word in words):
-        print(help_text(settings, conf))
-        sys.exit(0)
     with _reporting_errors(verb):
-        overrides = [word for word in words if not word.startswith("-")]
-        flags = {word for word in words if word.startswith("-")}
-        machine = defaults(overrides) if defaults is not None else []
-        if not flags:
-            _print_result(run, compose(settings, [*machine, *words], conf))
-        elif flags <= {"-m", "--multirun"}:
-            run_grid(verb, overrides, machine, lambda job: compose(settings, job, conf), _configuring(check))
+        line = command_line(sys.argv[1:])
+        if line.config_dir is not None:
+            add_folder(line.config_dir, conf)
+        elif user := folders(conf)[1:]:
+            add_folder(user[0], conf)
+        see_modules()
+        words, name = line.overrides, line.config_name
+        if line.help:
+            print(help_text(settings, conf, name))
+            sys.exit(0)
+        machine = defaults(words) if defaults is not None and name is None else []  # a named one says everything
+        if line.shows:
+            _show(line.shows, [*machine, *words], name or verb, conf)
+        elif line.multirun:
+            same = [] if name is None else [f"--config-name={name}"]
+            run_grid(verb, words, machine, same, lambda job: compose(settings, job, conf, name), _configuring(check))
         else:
-            _with_hydra(settings, run, words, machine, conf)
+            _print_result(run, compose(settings, [*machine, *words], conf, name))
     sys.exit(0)
 
 
@@ -141,31 +146,18 @@ def _configuring(check: Check[Settings] | None) -> Check[Settings] | None:
     return checked
 
 
-def _with_hydra(
-    settings: type[Settings], run: Run[Settings], words: Sequence[str], machine: Sequence[str], conf: Path
-) -> None:
-    """Hydra's own flags (``--cfg job``, ``--info`` ...), which show and run nothing."""
+def _show(flags: Sequence[str], words: Sequence[str], name: str, conf: Path) -> None:
+    """What Hydra shows of itself and of a configuration (``--cfg job``, ``--info`` ...); nothing is run."""
     import hydra
 
-    def task(cfg: DictConfig) -> None:
-        with _reporting_errors(settings.verb), configuring():
-            composed: Any = OmegaConf.to_container(cfg, resolve=True)
-            checked = settings.of(composed)
-        with _reporting_errors(settings.verb):
-            _print_result(run, checked)
+    primary = primary_file(name, conf)
+    beside = [f"--config-dir={folder}" for folder in folders(conf) if folder != primary.parent]
+    sys.argv = [sys.argv[0], *flags, *beside, *words]
+    hydra.main(config_path=str(primary.parent), config_name=name, version_base="1.3")(_nothing)()
 
-    hydra_defaults = {
-        "hydra.run.dir": ".",
-        "hydra.output_subdir": "null",
-        "hydra/job_logging": "none",
-        "hydra/hydra_logging": "none",
-    }
-    named = {word.partition("=")[0] for word in words}
-    # argparse takes the overrides from one place only: ours go in front of the user's first.
-    first = next((i for i, word in enumerate(words) if "=" in word), len(words))
-    inserted = [*(f"{key}={value}" for key, value in hydra_defaults.items() if key not in named), *machine]
-    sys.argv = [sys.argv[0], *words[:first], *inserted, *words[first:]]
-    hydra.main(config_path=str(conf), config_name=settings.verb, version_base="1.3")(task)()
+
+def _nothing(_: object) -> None:
+    """The task of a flag that only shows."""
 
 
 @contextmanager

@@ -30,7 +30,12 @@ SEVERAL = "grids"  # the experiment of a grid over several parts
 
 
 def run_grid(
-    verb: str, words: Sequence[str], machine: Sequence[str], compose: Compose[Settings], check: Check[Settings] | None
+    verb: str,
+    words: Sequence[str],
+    machine: Sequence[str],
+    flags: Sequence[str],
+    compose: Compose[Settings],
+    check: Check[Settings] | None,
 ) -> None:
     """Run all jobs of a grid, one after the other; a JSON object a job on stdout.
 
@@ -38,6 +43,7 @@ def run_grid(
         verb: for sentences.
         words: what the user said, without ``-m``; several values with commas between them, or ``range(...)``.
         machine: overrides that stand for the machine's default.
+        flags: that every job is started with.
         compose: the checked configuration of a job's words.
         check: raises ConfigurationError when a job cannot work.
 
@@ -66,7 +72,7 @@ def run_grid(
     try:
         for index, job in enumerate(jobs):
             log.info("%s %d of %d: %s", verb, index + 1, len(jobs), " ".join(_distinct_words(job, jobs)))
-            outcomes.append(_run_job(job, parent))
+            outcomes.append(_run_job(job, flags, parent))
             if outcomes[-1].code == INTERRUPTED:
                 raise KeyboardInterrupt
     except BaseException as error:
@@ -78,9 +84,9 @@ def run_grid(
         _leave_with(verb, failed, jobs)
 
 
-def _run_job(job: Sequence[str], parent: Any) -> Outcome:
+def _run_job(job: Sequence[str], flags: Sequence[str], parent: Any) -> Outcome:
     below = [] if parent is None else [f"tracking.parent={parent.id}"]
-    outcome = JobProcess(sys.argv[0], [*job, *below]).result()
+    outcome = JobProcess(sys.argv[0], [*flags, *job, *below]).result()
     if outcome.code != INTERRUPTED:
         answer = outcome.result if outcome.result is not None else {"failed": outcome.sentence}
         print(json.dumps({"overrides": list(job), **answer}), flush=True)
@@ -98,11 +104,11 @@ def _open_parent(verb: str, title: str, jobs: Sequence[Sequence[str]], configura
     tracking = first.get("tracking", {})
     if "parent" not in tracking:
         return None
-    from attentionvote.command.identity import without
+    from attentionvote.command.identity import identity
     from attentionvote.tracking.group_run import open_group
 
     # How the jobs are run is not what they are.
-    contents = [json.dumps(without(configuration.composed), sort_keys=True) for configuration in configurations]
+    contents = [json.dumps(identity(configuration, once=True), sort_keys=True) for configuration in configurations]
     digest = hashlib.sha256("\n".join([verb, *sorted(contents)]).encode()).hexdigest()
     parts = {configuration.composed["object"]["name"] for configuration in configurations}
     run = open_group(

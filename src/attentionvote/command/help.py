@@ -10,30 +10,39 @@ from typing import Any, get_origin
 
 from omegaconf import OmegaConf
 
-from attentionvote.command.conf_folder import choices, primary_groups
+from attentionvote.command.conf_folder import choices, is_group, primary_file, primary_groups
 from attentionvote.command.configuration import VerbSettings, compose, leaves
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.section import find
 from attentionvote.section import leaves as fields_below
 from attentionvote.setting import Field, wanted, without_null
 
+_FLAGS = (
+    "A comma-separated list of values with -m runs a grid (Hydra's multirun). --config-dir DIR adds a folder of yours",
+    "with configuration files and modules; --config-name NAME begins with one of its files; --cfg job shows the whole.",
+)
 
-def help_text(settings: type[VerbSettings], conf: Path) -> str:
+
+def help_text(settings: type[VerbSettings], conf: Path, name: str | None = None) -> str:
     """What ``--help`` prints.
 
     Args:
         settings: of the verb.
         conf: folder of the configuration files.
+        name: of the configuration to begin with, else the verb's.
+
+    Raises:
+        ConfigurationError: there is no such configuration.
     """
     verb = settings.verb
     lines = [(sys.modules["__main__"].__doc__ or verb).strip(), ""]
-    groups = primary_groups(verb, conf)
-    lines += [f"  {name}=  {' | '.join(choices(name, conf))}" for name in groups if (conf / name).is_dir()]
+    groups = primary_groups(name or verb, conf)
+    lines += [f"  {group}=  {' | '.join(choices(group, conf))}" for group in groups if is_group(group, conf)]
     mandatory = [f"{g}={choices(g, conf)[0]}" for g, v in groups.items() if v == "???" and choices(g, conf)]
     try:
-        composed = compose(settings, mandatory, conf).composed
+        composed = compose(settings, mandatory, conf, name).composed
     except ConfigurationError:  # e.g. a mandatory setting: show what the file itself holds
-        primary = OmegaConf.to_container(OmegaConf.load(conf / f"{verb}.yaml"), resolve=False)
+        primary = OmegaConf.to_container(OmegaConf.load(primary_file(name or verb, conf)), resolve=False)
         assert isinstance(primary, dict)
         composed = {str(key): value for key, value in primary.items() if key not in ("defaults", "hydra")}
     lines += ["", "Settings (key=value) and their defaults:"]
@@ -48,10 +57,10 @@ def help_text(settings: type[VerbSettings], conf: Path) -> str:
     known = dict(leaves(composed))
     more = [(key, f) for key, f in fields_below(settings) if f.default is not ... and not _stands(key, known)]
     if more:
-        lines += ["", "Settings that conf/ leaves out (+key=value):"]
+        lines += ["", "Settings that conf/ leaves out:"]
         for key, field in more:
-            lines += [f"  +{key}={json.dumps(field.default, ensure_ascii=False, default=str)}", *_meaning(field)]
-    return "\n".join([*lines, "", "A comma-separated list of values with -m runs a grid (Hydra's multirun)."])
+            lines += [f"  {key}={json.dumps(field.default, ensure_ascii=False, default=str)}", *_meaning(field)]
+    return "\n".join([*lines, "", *_FLAGS])
 
 
 def _stands(key: str, known: Mapping[str, Any]) -> bool:

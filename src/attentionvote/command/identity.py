@@ -1,25 +1,57 @@
-"""Settings that do not change a result: left out where a configuration is identified."""
+"""The settings that identify a result: a training, a grid, a trial."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
-# What may change between two calls that mean the same training: it does not change what is learned.
-NOT_IDENTITY = (
-    *("resume", "force", "workers", "executor", "cluster", "tracking", "outputs", "root"),
-    *("data.workers", "trainer.threads"),
-)
+from attentionvote.command.configuration import VerbSettings
+from attentionvote.section import find, is_target, located
+from attentionvote.setting import Identity, fields_of, without_null
+
 NETWORK = "attentionvote.model.AttentionVote"  # the class that conf/model named before 0.2
 
 
-def without(composed: Mapping[str, Any], keys: tuple[str, ...] = NOT_IDENTITY) -> dict[str, Any]:
-    """A copy of plain settings without these dotted keys; those that are not there are passed over."""
-    plain = deepcopy(dict(composed))
-    for key in keys:
-        section, _, leaf = key.rpartition(".")
-        (plain.get(section, {}) if section else plain).pop(leaf, None)
+def identity(settings: VerbSettings, *, once: bool = False) -> dict[str, Any]:
+    """The plain settings that identify a result (see ``setting.Identity``), as they were composed.
+
+    Args:
+        settings: of a verb.
+        once: whether those count that did in earlier versions.
+    """
+    plain = _identifying(type(settings), settings.composed, once)
     if "model" in plain:  # a training keeps its identity
         plain["model"]["_target_"] = NETWORK
+    return plain
+
+
+def identifies(settings: type[VerbSettings], key: str, values: Mapping[str, Any] | None = None) -> bool:
+    """Whether a dotted key is of a setting that identifies a result.
+
+    Args:
+        settings: of a verb.
+        key: of a setting.
+        values: of the settings, which tell the ``_target_`` of a section that has one.
+    """
+    names = key.split(".")
+    fields = (find(settings, ".".join(names[: count + 1]), values) for count in range(len(names)))
+    return not any(field and field.setting.identity in (Identity.NEVER, Identity.ONCE) for field in fields)
+
+
+def _identifying(section: Any, values: Mapping[str, Any], once: bool) -> dict[str, Any]:
+    fields = fields_of(section)
+    plain: dict[str, Any] = {}
+    for name, value in values.items():
+        field = fields.get(name)
+        if field is not None:
+            counts = field.setting.identity
+            if counts is Identity.NEVER or (counts is Identity.ONCE and not once):
+                continue
+            if counts is Identity.CHANGED and value == field.default:
+                continue
+            inner, _ = without_null(field.type)
+            if isinstance(value, Mapping) and dataclasses.is_dataclass(inner):
+                value = _identifying(located(str(value["_target_"])) if is_target(inner) else inner, value, once)
+        plain[name] = value
     return plain

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from attentionvote.execution.run import EXECUTORS
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
 from attentionvote.simulation.sensor import Sensor
 
 WORKERS = Setting("Processes; null = one per core.", low=1, high=1024)
@@ -15,7 +15,11 @@ TRUSTED_KEY = Setting(
     "Public key that must have signed the bundle; null = signing.pub in ATTENTIONVOTE_KEYS, else in "
     "~/.config/attentionvote."
 )
-EXECUTOR = Setting("Where jobs run: local (this machine), ray or slurm (settings: cluster).", choices=EXECUTORS)
+EXECUTOR = Setting(
+    "Where jobs run: local (this machine), ray or slurm (settings: cluster).",
+    choices=EXECUTORS,
+    identity=Identity.NEVER,
+)
 
 
 def no_password(instead: str) -> Any:

@@ -6,8 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from attentionvote.data.augmentation import Augmentation
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
 from attentionvote.simulation.sensor import Sensor
+
+LOADERS = Setting(
+    "Loader processes of each process; 0 = in the training process.", low=0, high=1024, identity=Identity.NEVER
+)
 
 
 @dataclass(frozen=True)
@@ -36,4 +40,4 @@ class DataSettings:
     normal_neighbors: Annotated[int, Setting("Neighbours of the normal estimation.", low=3, high=1000)]
     points: Annotated[int, Setting("N, points of a sample.", low=3, high=10_000_000)]
     augmentation: Augmentation
-    workers: Annotated[int, Setting("Loader processes of each process; 0 = in the training process.", low=0, high=1024)]
+    workers: Annotated[int, LOADERS]

@@ -95,8 +95,3 @@ class NetworkSettings:
         for name in ("centers", "neighbors", "widths"):
             if len(getattr(self, name)) != LEVELS:
                 raise SettingError(f"{name} must have {LEVELS} entries, one a level; got {list(getattr(self, name))}")
-        for name in ("propagation", "fusion", "head"):
-            if not getattr(self, name):
-                raise SettingError(f"{name} must have at least one width; got []")
-        if not all(self.widths):
-            raise SettingError(f"widths must have at least one width a level; got {[list(w) for w in self.widths]}")

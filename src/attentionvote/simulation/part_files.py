@@ -8,9 +8,15 @@ from typing import Annotated, Any
 
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part, PartSet
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
 
 BUILTIN = "builtin:"
+
+
+def _no_symmetry(value: object) -> str:
+    """What is wrong with a value that is no symmetry at all."""
+    keys = ", ".join(Symmetry.__dataclass_fields__)
+    return "" if isinstance(value, (Mapping, Symmetry)) else f"must be a section with keys {keys}; got {value!r}"
 
 
 def load_part(
@@ -18,8 +24,8 @@ def load_part(
     mesh: Annotated[str, Setting("builtin:NAME of the catalogue, or the path of a mesh file in the part frame.")],
     diameter: Annotated[float | None, Setting("D in metres; null = from the surface.", above=0, high=10)] = None,
     units: Annotated[str, Setting("Unit of the file's numbers.", choices=("m", "cm", "mm", "inch"))] = "m",
-    symmetry: Annotated[Any, Setting("Proper symmetry in the part frame.")] = None,
-    title: Annotated[str, Setting("One line for people.")] = "",
+    symmetry: Annotated[Any, Setting("Proper symmetry in the part frame.", problem=_no_symmetry)] = None,
+    title: Annotated[str, Setting("One line for people.", identity=Identity.ONCE)] = "",
     base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
     voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
 ) -> Part:
@@ -66,7 +72,7 @@ def load_part(
 def load_parts(
     name: Annotated[str, Setting("Stem of the configuration file.")],
     parts: Annotated[Any, Setting("By name the settings of each part, in the order of the network's classes.")],
-    title: Annotated[str, Setting("One line for people.")] = "",
+    title: Annotated[str, Setting("One line for people.", identity=Identity.ONCE)] = "",
     base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
     voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
 ) -> PartSet:

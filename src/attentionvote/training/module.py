@@ -14,12 +14,14 @@ from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.model.network import AttentionVote
 from attentionvote.model.predictions import Predictions
 from attentionvote.part import Parts
+from attentionvote.section import Factory
 from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY
 from attentionvote.training.detections import scene_results
 from attentionvote.training.losses import AttentionVoteLoss
+from attentionvote.training.optimization import optimizer_of, paper_rate
 from attentionvote.training.proposal_counts import ProposalCounts, proposal_counts
-from attentionvote.training.schedule import Schedule
+from attentionvote.training.schedule import RateSchedule, Schedule
 from attentionvote.training.step import batch_loss
 
 
@@ -31,8 +33,9 @@ class PoseTraining(L.LightningModule):
         loss: its losses.
         part: for the metrics; or the set of parts that the network's classes are.
         schedule: learning rate and warm-up.
-        optimizer: ``adam`` (the paper's) or ``adamw``.
+        optimizer: ``adam`` (the paper's), ``adamw`` or another.
         learning_rate, weight_decay: of the optimiser.
+        rate_schedule: learning rate instead of the schedule's.
         peak_threshold: heat a proposal needs to count at validation (paper: 0.4).
         train_heat: heat a proposal needs to be trained on.
         metadata: plain values that every checkpoint carries, see ``checkpoint.load_trained``.
@@ -44,12 +47,13 @@ class PoseTraining(L.LightningModule):
         loss: AttentionVoteLoss,
         part: Parts,
         schedule: Schedule,
-        optimizer: str = "adam",
+        optimizer: str | Factory = "adam",
         learning_rate: float = 1e-3,
         weight_decay: float = 0.0,
         peak_threshold: float = 0.4,
         train_heat: float = 0.1,
         metadata: Mapping[str, Any] | None = None,
+        rate_schedule: RateSchedule | None = None,
     ) -> None:
         super().__init__()
         if model.classes != len(part.parts):
@@ -60,6 +64,7 @@ class PoseTraining(L.LightningModule):
         self.model, self.loss, self.part, self.schedule = model, loss, part, schedule
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.peak_threshold, self.train_heat = peak_threshold, train_heat
+        self.rate_schedule = rate_schedule
         self.voting_radius = model.voting_radius
         self.results: list[SceneResult] = []
 
@@ -118,19 +123,15 @@ class PoseTraining(L.LightningModule):
         return list(zip(scene_results(predictions, batch, self.peak_threshold), counts, strict=True))
 
     def configure_optimizers(self) -> Any:
-        """Adam or AdamW (no decay on biases and norms) with the schedule's rate, changed every step."""
-        decayed = [p for p in self.parameters() if p.ndim > 1]
-        plain = [p for p in self.parameters() if p.ndim <= 1]
-        groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-        kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.optimizer]
-        # One pass over each weight instead of ten; in mixed precision Lightning clips no gradients of such a one.
+        """The optimizer and its learning rate (``training.optimization``)."""
         fused = str(self.trainer.precision).endswith("-true")
-        optimizer = kind(groups, lr=self.learning_rate, foreach=not fused, fused=fused)
+        optimizer = optimizer_of(self.optimizer, self.parameters(), self.learning_rate, self.weight_decay, fused=fused)
         total = int(self.trainer.estimated_stepping_batches)
-        per_epoch = max(1, int(self.trainer.num_training_batches))
-        factor = self.schedule.rate_factor(total, per_epoch)
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+        if self.rate_schedule is not None:
+            every = self.trainer.check_val_every_n_epoch or 1
+            return {"optimizer": optimizer, "lr_scheduler": self.rate_schedule.configured(optimizer, total, every)}
+        per_epoch = max(1, -(-int(self.trainer.num_training_batches) // self.trainer.accumulate_grad_batches))
+        return {"optimizer": optimizer, "lr_scheduler": paper_rate(self.schedule, optimizer, total, per_epoch)}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what is needed to build the network again without the configuration."""

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from attentionvote.section import check
-from attentionvote.setting import Setting
+from attentionvote.section import Factory, check, located
+from attentionvote.setting import Setting, SettingError
 
+if TYPE_CHECKING:
+    from torch.optim import Optimizer
+
+JUDGED_BY = "val/ap"  # what the best checkpoint has most of
 Shape = Literal["step", "cosine", "constant"]
 
 
@@ -65,3 +70,45 @@ class Schedule:
     def ramp(self, step: int) -> float:
         """Share of the instance losses in [0, 1]: 0 during the warm-up, then rising."""
         return min(1.0, max(0.0, (step - self.vote_steps + 1) / max(1, self.ramp_steps)))
+
+
+@dataclass(frozen=True)
+class RateSchedule(Factory):
+    """A section that names a class of ``torch.optim.lr_scheduler``, or one that works alike.
+
+    Attributes:
+        interval: whether it goes on with every ``step`` or every ``epoch``; as Lightning has it the latter, but for a
+            schedule over a total number of steps.
+    """
+
+    interval: str = "epoch"
+    given: ClassVar[int] = 1
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], key: str = "") -> Self:
+        """As ``Target.of``; ``interval`` is ours, not the target's."""
+        arguments = {name: value for name, value in values.items() if name != "interval"}
+        made = super().of(arguments, key)
+        interval = values.get("interval", "step" if "total_steps" in made.parameters else "epoch")
+        if interval not in ("step", "epoch"):
+            raise SettingError(f"{key}.interval must be one of step, epoch; got {interval!r}")
+        return cls(made.path, made.arguments, interval)
+
+    def configured(self, optimizer: Optimizer, total_steps: int, every_epochs: int) -> dict[str, Any]:
+        """For Lightning's ``configure_optimizers``.
+
+        Args:
+            optimizer: whose rate it changes.
+            total_steps: of the training, where the schedule asks for them.
+            every_epochs: epochs between validations, after which a schedule that judges the score is told it.
+        """
+        more: dict[str, Any] = {}
+        if "total_steps" in self.parameters and not {"epochs", "steps_per_epoch"} & self.arguments.keys():
+            more["total_steps"] = total_steps
+        judging = "metrics" in inspect.signature(located(self.path).step).parameters
+        if judging and "mode" in self.parameters:
+            more["mode"] = "max"
+        configured: dict[str, Any] = {"scheduler": self(optimizer, **more), "interval": self.interval}
+        if judging:
+            configured |= {"monitor": JUDGED_BY, "frequency": every_epochs}
+        return configured

@@ -6,9 +6,25 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from attentionvote.section import check
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
 from attentionvote.training.schedule import Schedule
 
+CHANGED = Identity.CHANGED
+
+
+def _no_share(value: float) -> str:
+    if isinstance(value, int) or value <= 1:
+        return ""
+    return f"must be a share of at most 1.0, or a whole number of batches; got {value}"
+
+
+LIMIT = Setting(
+    "Batches of an epoch, or with a point the share of them; null = all.",
+    above=0,
+    high=1_000_000,
+    identity=CHANGED,
+    problem=_no_share,
+)
 RotationLoss = Literal["metric", "slerp", "minra", "nlerp"]
 
 
@@ -83,7 +99,9 @@ class TrainerSettings:
         float, Setting("Moving average of the weights, tested and exported; 0 = none.", low=0, high=0.999999)
     ]
     validate_every: Annotated[int, Setting("Epochs between validations.", low=1, high=1_000_000)]
-    log_every_steps: Annotated[int, Setting("Steps between logged losses.", low=1, high=1_000_000)]
+    log_every_steps: Annotated[
+        int, Setting("Steps between logged losses.", low=1, high=1_000_000, identity=Identity.ONCE)
+    ]
     precision: Annotated[
         str,
         Setting(
@@ -93,7 +111,53 @@ class TrainerSettings:
     ]
     accelerator: Annotated[str, Setting("Where the network is trained.", choices=("auto", "cpu", "gpu", "cuda", "mps"))]
     threads: Annotated[
-        int | None, Setting("Of the arithmetic, of each process; null = its share of the cores.", low=1, high=1024)
+        int | None,
+        Setting(
+            "Of the arithmetic, of each process; null = its share of the cores.",
+            low=1,
+            high=1024,
+            identity=Identity.NEVER,
+        ),
     ]
     peak_threshold: Annotated[float, Setting("Heat a proposal needs at validation and in the cell.", low=0, high=1000)]
     train_heat: Annotated[float, Setting("Heat a proposal needs to be trained on.", low=0, high=1000)]
+    # Switches of Lightning's Trainer by its names.
+    max_steps: Annotated[
+        int | None,
+        Setting("Most optimizer steps; null = max_epochs alone.", low=1, high=1_000_000_000, identity=CHANGED),
+    ] = None
+    accumulate_grad_batches: Annotated[
+        int, Setting("Batches whose gradients make one step.", low=1, high=100_000, identity=CHANGED)
+    ] = 1
+    limit_train_batches: Annotated[int | float | None, LIMIT] = None
+    limit_val_batches: Annotated[int | float | None, LIMIT] = None
+    fast_dev_run: Annotated[
+        bool | int,
+        Setting(
+            "So many batches (true = 1) of training and validation, to try the code: nothing is tested or tracked.",
+            low=0,
+            high=100_000,
+            identity=CHANGED,
+        ),
+    ] = False
+    deterministic: Annotated[
+        bool, Setting("Only algorithms that give the same bits again, also on a GPU.", identity=CHANGED)
+    ] = False
+    profiler: Annotated[
+        Literal["simple", "advanced", "pytorch"] | None,
+        Setting("Of Lightning; its report lies in the training's folder.", identity=Identity.NEVER),
+    ] = None
+
+    @property
+    def dev_batches(self) -> int:
+        """Batches of ``fast_dev_run``, 0 for a training."""
+        return int(self.fast_dev_run)
+
+    def steps(self, scenes: int) -> int:
+        """Optimizer steps of a training on so many scenes."""
+        batches = scenes // self.batch_size
+        limit = self.limit_train_batches
+        if limit is not None:
+            batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        steps = -(-batches // self.accumulate_grad_batches) * self.max_epochs
+        return steps if self.max_steps is None else min(steps, self.max_steps)

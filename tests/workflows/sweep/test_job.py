@@ -57,7 +57,7 @@ def sweep_of(words: list[str]) -> SweepJob:
 
 
 def run(words: list[str]) -> dict[str, Any]:
-    return json.loads(json.dumps(sweep.run(compose(SweepSettings, words), words)))
+    return json.loads(json.dumps(sweep.run(compose(SweepSettings, words))))
 
 
 @pytest.mark.slow

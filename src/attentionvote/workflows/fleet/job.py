@@ -28,12 +28,11 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.fleet")
 
 
-def run(cfg: FleetSettings, words: Sequence[str]) -> dict[str, Any]:
+def run(cfg: FleetSettings) -> dict[str, Any]:
     """Bring every part to its evaluation; the leaderboard.
 
     Args:
-        cfg: the fleet's configuration.
-        words: it was composed of; those of the training are handed on to every part.
+        cfg: the fleet's configuration, whose words about the training are handed on to every part.
     """
     from attentionvote.command.executors import cores_of_a_job, executor_of
     from attentionvote.execution.job_process import handed_on
@@ -41,7 +40,7 @@ def run(cfg: FleetSettings, words: Sequence[str]) -> dict[str, Any]:
     from attentionvote.workflows.chain import MemberTask
     from attentionvote.workflows.fleet import board as fleet_board
 
-    training = [*preset_of_workers(cfg, words), *training_words(words)]
+    training = [*preset_of_workers(cfg, cfg.words), *training_words(cfg.words)]
     with configuring():
         executor = executor_of(cfg)
     jobs, left_out = members(cfg.objects, training)

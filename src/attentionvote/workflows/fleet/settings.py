@@ -18,8 +18,8 @@ class FleetSettings(TrainSettings):
 
     verb: ClassVar[str] = "fleet"
     objects: Annotated[str, Setting("Names with commas between them, or all: every part whose mesh is there.")]
-    export: Annotated[tuple[str, ...], Setting("Words for the export of every part.")]
-    evaluate: Annotated[tuple[str, ...], Setting("Words for the evaluation of every part.")]
+    export: Annotated[tuple[str, ...], Setting("Words for the export of every part.", empty=True)]
+    evaluate: Annotated[tuple[str, ...], Setting("Words for the evaluation of every part.", empty=True)]
     threads: Annotated[int | None, THREADS]
     retries: Annotated[int, RETRIES]
     fleets: Annotated[str, Setting("Where leaderboard and logs lie.")]

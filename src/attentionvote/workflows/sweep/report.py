@@ -16,9 +16,9 @@ from optuna.exceptions import OptunaError
 from optuna.importance import get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from attentionvote.command.conf_folder import CONF
+from attentionvote.command.conf_folder import CONF, is_group
 from attentionvote.command.errors import ConfigurationError
-from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.command.identity import identifies
 from attentionvote.command.words import parse
 from attentionvote.files import read_json, write_whole
 from attentionvote.workflows.sweep.space import Setting
@@ -101,10 +101,10 @@ def experiment_text(words: Sequence[str], values: Mapping[str, Any], title: str)
             raise ConfigurationError(f"a sweep takes no word that deletes a setting, got {override.input_line!r}")
         if key == "experiment":
             bases = [] if override.value() is None else [str(override.value())]
-        elif (CONF / key).is_dir():
+        elif is_group(key):
             if key != "object":
                 overrides.append({f"override /{key}": override.value()})
-        elif key not in NOT_IDENTITY and not key.startswith("tracking."):
+        elif identifies(TrainSettings, key):
             _put(settings, key, _plain(override.value()))
     for name, value in values.items():
         _put(settings, name, value)

@@ -10,11 +10,12 @@ from functools import reduce
 from operator import getitem
 from typing import TYPE_CHECKING, Any
 
-from attentionvote.command.configuration import check_types, leaves, type_problem
+from attentionvote.command.configuration import leaves
 from attentionvote.command.errors import ConfigurationError, nearest
-from attentionvote.command.identity import NOT_IDENTITY
+from attentionvote.command.identity import identifies
 from attentionvote.section import check_value
-from attentionvote.setting import SettingError
+from attentionvote.setting import Setting as AnySetting
+from attentionvote.setting import SettingError, scalar_problem
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
@@ -101,7 +102,7 @@ def _setting(entry: Any, defaults: Mapping[str, Any]) -> Setting:
     where = f"sweep.space, {name}"
     if name not in defaults:
         raise ConfigurationError(f"sweep.space must name settings of a training, got {name!r}{nearest(name, defaults)}")
-    if name in NOT_IDENTITY or name.startswith(("tracking.", "object.")):
+    if name.startswith("object.") or not identifies(TrainSettings, name):
         what = "the part" if name.startswith("object.") else "how a training is run"
         raise ConfigurationError(f"sweep.space must name settings of what is learned, but {name!r} is about {what}")
     if kind not in _FIELDS:
@@ -114,7 +115,6 @@ def _setting(entry: Any, defaults: Mapping[str, Any]) -> Setting:
     values = _choices(entry, where) if kind == "categorical" else _bounds(entry, where, kind)
     for value in values:
         try:
-            check_types(TrainSettings, name, defaults[name], value)
             check_value(TrainSettings, name, value)
         except (ConfigurationError, SettingError) as error:
             raise ConfigurationError(f"sweep.space: {error}") from None
@@ -139,12 +139,10 @@ def _choices(entry: Mapping[str, Any], where: str) -> list[Any]:
 def _bounds(entry: Mapping[str, Any], where: str, kind: str) -> list[Any]:
     bounds: list[Any] = []
     for field in ("low", "high"):
-        value = entry.get(field)
-        problem = type_problem(1 if kind == "int" else 1.0, value)
+        bounds.append(entry.get(field))
+        problem = scalar_problem(bounds[-1], int if kind == "int" else float, AnySetting(""), False)
         if problem:
-            got = "none" if field not in entry else repr(value)
-            raise ConfigurationError(f"{where}: {field} must be {problem.removesuffix(',')}, got {got}")
-        bounds.append(value)
+            raise ConfigurationError(f"{where}: {field} must be {problem}")
     low, high = bounds
     if not low < high:
         raise ConfigurationError(f"{where}: low must be less than high, got {low} and {high}")

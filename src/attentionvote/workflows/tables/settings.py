@@ -33,8 +33,8 @@ class TablesSettings(TrainSettings):
     objects: Annotated[str | None, Setting("Names with commas between them; null = the table's.")]
     rows: Annotated[str | None, Setting("Rows to measure, names with commas between; null = all.")]
     train: Annotated[bool, Setting('Train what is not trained yet; without it such cells are "not run".')]
-    export: Annotated[tuple[str, ...], Setting("Words for the exports.")]
-    evaluate: Annotated[tuple[str, ...], Setting("Words for the evaluations.")]
+    export: Annotated[tuple[str, ...], Setting("Words for the exports.", empty=True)]
+    evaluate: Annotated[tuple[str, ...], Setting("Words for the evaluations.", empty=True)]
     baseline_workers: Annotated[
         int | None, Setting("Processes of the classical baseline; null = one per core.", low=1, high=1024)
     ]

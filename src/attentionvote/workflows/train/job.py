@@ -7,15 +7,17 @@ import json
 import logging
 import shutil
 from contextlib import AbstractContextManager
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attentionvote.command.executors import executor_of
-from attentionvote.command.identity import without
+from attentionvote.command.identity import identity
 from attentionvote.files import locked_folder, read_json
 from attentionvote.part import Parts, only_part
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
+from attentionvote.workflows.train.beginning import MODEL, origin
 from attentionvote.workflows.train.network import check_classes
 from attentionvote.workflows.train.settings import TrainSettings
 
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
     from attentionvote.data.dataset_splits import DatasetSplits
 
 log = logging.getLogger("attentionvote.train")
-RUN, RESULT, MODEL = "run.json", "result.json", "model.ckpt"
+RUN, RESULT = "run.json", "result.json"
+_MOST_EPOCHS = 10_000  # by which a training may be longer than the one it goes on from
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,14 @@ class TrainingJob:
         part: what it looks for, or a set of parts.
         specs: of the scene sets it needs, by split; empty with a dataset.
         dataset: whose scenes it takes instead.
+        shorter: folder of the same training with fewer epochs, which it goes on from.
     """
 
     directory: Path
     part: Parts
     specs: dict[str, SceneSetSpec]
     dataset: DatasetSplits | None = None
+    shorter: Path | None = None
 
     @property
     def scene_counts(self) -> dict[str, int]:
@@ -92,17 +97,41 @@ def find_training(cfg: TrainSettings) -> TrainingJob:
     if cfg.data.dataset is not None:
         job = replace(job, specs={}, dataset=_dataset(cfg, cfg.data.dataset, part))
     _check(cfg, job.scene_counts["train"])
-    plain = without(cfg.composed)
-    if len(part.parts) > 1:  # whether the number was also typed makes no other training
-        plain["model"]["classes"] = len(part.parts)
+    begins_with = {} if cfg.init is None else {"init": origin(cfg.init, cfg.tracking.store)}
+    folder, folder_once = (
+        job.directory / _digest({**identity(cfg, once=once), **begins_with}, job) for once in (False, True)
+    )
+    # A training of an earlier version is found where that put it.
+    directory = folder if folder.exists() or not folder_once.exists() else folder_once
+    return replace(job, directory=directory, shorter=_shorter(cfg, job, directory))
+
+
+def _shorter(cfg: TrainSettings, job: TrainingJob, directory: Path) -> Path | None:
+    """The complete training that is this one but for its fewer epochs, the longest; None where there is none."""
+    begun = (directory / "checkpoints").exists()
+    trained = {file.parent.name for file in job.directory.glob(f"*/{RESULT}")}
+    if begun or not trained or cfg.init is not None or cfg.trainer.max_steps is not None:
+        return None
+    for once in (False, True):
+        plain = identity(cfg, once=once)
+        for epochs in range(cfg.trainer.max_epochs - 1, max(0, cfg.trainer.max_epochs - _MOST_EPOCHS), -1):
+            plain["trainer"]["max_epochs"] = epochs
+            if (name := _digest(deepcopy(plain), job)) in trained:
+                return job.directory / name
+    return None
+
+
+def _digest(plain: dict[str, Any], job: TrainingJob) -> str:
+    """What identifies a training: its settings, its part, the scenes of a dataset."""
+    if len(job.part.parts) > 1:  # whether the number was also typed makes no other training
+        plain["model"]["classes"] = len(job.part.parts)
     del plain["data"]["held_out"]  # what was trained without a dataset keeps its digest
     if job.dataset is None:
         del plain["data"]["dataset"]
     else:  # the scenes are the identity, wherever they lie
         del plain["simulation"]
         plain["data"]["dataset"] = {split: scenes.digest for split, scenes in job.dataset.splits.items()}
-    digest = hashlib.sha256(json.dumps([plain, part.digest], sort_keys=True).encode()).hexdigest()
-    return replace(job, directory=job.directory / digest[:12])
+    return hashlib.sha256(json.dumps([plain, job.part.digest], sort_keys=True).encode()).hexdigest()[:12]
 
 
 def _dataset(cfg: TrainSettings, folder: str, part: Parts) -> DatasetSplits:
@@ -123,8 +152,8 @@ def _check(cfg: TrainSettings, scenes: int) -> None:
         raise ValueError(
             f"trainer.batch_size must be at most the {scenes} training scenes, got {cfg.trainer.batch_size}"
         )
-    steps = scenes // cfg.trainer.batch_size * cfg.trainer.max_epochs
-    if cfg.trainer.schedule.vote_steps >= steps:
+    steps = cfg.trainer.steps(scenes)
+    if not cfg.trainer.dev_batches and cfg.trainer.schedule.vote_steps >= steps:
         raise ValueError(
             f"trainer.schedule.vote_steps must be less than the {steps} steps of the training, or no pose is ever "
             f"trained; got {cfg.trainer.schedule.vote_steps}"

@@ -11,8 +11,6 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from attentionvote import __version__
 from attentionvote.command.executors import executor_of
@@ -30,9 +28,7 @@ from attentionvote.training.messages import plain_loader_errors, quiet_lightning
 from attentionvote.training.module import PoseTraining
 from attentionvote.training.pictures import ScenePictures
 from attentionvote.training.progress import TrainingProgress
-from attentionvote.training.synced_norm import RowNormSync
-from attentionvote.training.termination import PlainTermination
-from attentionvote.workflows.sweep.trial_report import trial_callbacks
+from attentionvote.workflows.train.beginning import checkpoint_of, take_over, take_weights
 from attentionvote.workflows.train.data import prepare_data
 from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
 from attentionvote.workflows.train.network import described, network_arguments
@@ -40,6 +36,7 @@ from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
 from attentionvote.workflows.train.results import SplitDetections, assess, best_score, detect_everything, log_losses
 from attentionvote.workflows.train.settings import TrainSettings
 from attentionvote.workflows.train.tracking import open_tracking
+from attentionvote.workflows.train.trainer import lightning_trainer, made
 
 log = logging.getLogger("attentionvote.train")
 
@@ -83,17 +80,21 @@ class TrainingRun:
             loss,
             part,
             t.schedule,
-            t.optimizer,
+            cfg.optimizer or t.optimizer,
             t.learning_rate,
             t.weight_decay,
             t.peak_threshold,
             t.train_heat,
             json.loads(json.dumps(metadata)),  # plain values only: what torch.load(weights_only=True) accepts
+            cfg.schedule,
         )
         self.augmentation = cfg.data.augmentation
         self.workers = cfg.workers or cores()
+        self.progress, self.pictures, self.checkpoint_files = TrainingProgress(), ScenePictures(), AtomicCheckpoints()
         with quiet_lightning():
-            self.trainer = self._trainer()
+            self.trainer = lightning_trainer(
+                cfg, job.directory, process, [self.progress, self.pictures], self.checkpoint_files
+            )
         # Lightning itself does so only after the average of the weights was set up and a checkpoint was loaded.
         self.trainer.precision_plugin.convert_module(self.module)
 
@@ -115,8 +116,11 @@ class TrainingRun:
             data = self._data_module(clouds)
             if self.process.rank:
                 self._fit(data, None)
-                self._detect(data)
+                if not self.cfg.trainer.dev_batches:
+                    self._detect(data)
                 return None
+            if self.cfg.trainer.dev_batches:
+                return self._tried(self._fit(data, None))
             with open_tracking(
                 self.job, self.module, self._choices(), self.process.processes, self.cfg.tracking, self.cfg.yaml()
             ) as tracked:
@@ -147,6 +151,16 @@ class TrainingRun:
             "/".join(f"{assessed['metrics'][f'ap_{k}']:.3f}" for k in (10, 5, 2)),
         )
         return result
+
+    def _tried(self, progress: TrainingProgress) -> dict[str, Any]:
+        """What ``fast_dev_run`` ends with."""
+        return {
+            "stage": "train",
+            "object": self.part.name,
+            "fast_dev_run": self.cfg.trainer.dev_batches,
+            "steps": self.trainer.global_step,
+            "train_seconds": round(progress.seconds, 1),
+        }
 
     def _choices(self) -> dict[str, object]:
         """What tells trainings apart at a glance: parameters of the run."""
@@ -200,43 +214,6 @@ class TrainingRun:
             self.process.processes,
         )
 
-    def _trainer(self) -> L.Trainer:
-        t, folder = self.cfg.trainer, self._checkpoints
-        best = ModelCheckpoint(folder, "best", monitor="val/ap", mode="max", enable_version_counter=False)
-        last = ModelCheckpoint(folder, "last", enable_version_counter=False, save_on_train_epoch_end=True)
-        self.progress = TrainingProgress()
-        self.pictures = ScenePictures()
-        self.checkpoint_files = AtomicCheckpoints()
-        callbacks: list[Callback] = [best, last, self.progress, self.pictures]
-        callbacks += trial_callbacks()
-        if t.average_decay:
-            callbacks.append(EMAWeightAveraging(decay=t.average_decay, use_buffers=True))
-        if self.process.processes > 1:
-            callbacks.append(PlainTermination())
-        try:
-            return self._lightning_trainer(callbacks)
-        except (MisconfigurationException, RuntimeError) as error:  # no such device, say
-            raise ValueError(f"trainer settings cannot be met: {error}") from error
-
-    def _lightning_trainer(self, callbacks: list[Callback]) -> L.Trainer:
-        t = self.cfg.trainer
-        return L.Trainer(
-            accelerator=t.accelerator,
-            **self.process.trainer_arguments(),
-            precision=self._precision(),
-            max_epochs=t.max_epochs,
-            gradient_clip_val=t.gradient_clip,
-            check_val_every_n_epoch=t.validate_every,
-            log_every_n_steps=t.log_every_steps,
-            num_sanity_val_steps=0,
-            logger=False,
-            callbacks=callbacks,
-            plugins=[self.checkpoint_files, *([RowNormSync()] if self.process.processes > 1 else [])],
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            default_root_dir=self.job.directory,
-        )
-
     def _fit(self, data: PartDataModule, tracked: Any | None) -> TrainingProgress:
         """Train to the end, from wherever an earlier call came to; only the first process tracks."""
         trainer = self.trainer
@@ -244,11 +221,23 @@ class TrainingRun:
             self._track(tracked)
         shapes = {name: value.shape for name, value in self.module.state_dict().items()}
         files = [self._checkpoints / "last.ckpt", self._checkpoints / "best.ckpt"]
-        start = self.first_does("checkpoint", lambda: str(usable_checkpoint(files, shapes) or ""))
+        start = self.first_does("checkpoint", lambda: self._begin(files, shapes))
+        if not start and self.cfg.init is not None:
+            store, folder = self.cfg.tracking.store, self.job.directory / "init"
+            path = self.first_does("init", lambda: str(checkpoint_of(str(self.cfg.init), store, folder)))
+            take_weights(self.module.model, Path(path), self.cfg.init)
         trainer.fit(self.module, data, ckpt_path=start or None, weights_only=True)
         if trainer.interrupted:
             raise KeyboardInterrupt
         return self.progress
+
+    def _begin(self, files: list[Path], shapes: dict[str, torch.Size]) -> str:
+        """The checkpoint to go on from, empty at the beginning; of a shorter training where there is one."""
+        if self.cfg.trainer.dev_batches:
+            return ""
+        if self.job.shorter is not None and self.cfg.resume != "never" and not self.cfg.force:
+            take_over(self.job.shorter, self.job.directory)
+        return str(usable_checkpoint(files, shapes) or "")
 
     def _track(self, tracked: Any) -> None:
         """Metrics, checkpoints and pictures go to the run."""
@@ -261,15 +250,11 @@ class TrainingRun:
 
         self.pictures.draw = draw
         self.checkpoint_files.before_save = tracked.flush_metrics
-        self.trainer.loggers = [RunLogger(tracked)]
+        more = [made(f"loggers.{name}", logger) for name, logger in self.cfg.loggers.items()]
+        self.trainer.loggers = [RunLogger(tracked), *more]
 
     def _detect(self, data: PartDataModule) -> tuple[Path, dict[str, SplitDetections]]:
         """The checkpoint that the training ends with, and what it finds (in the first process, of all)."""
         files = [self._checkpoints / "best.ckpt", self._checkpoints / "last.ckpt"]
         weights = Path(self.first_does("weights", lambda: str(next(path for path in files if path.is_file()))))
         return weights, detect_everything(self.module, data, weights, self.trainer.strategy.root_device)
-
-    def _precision(self) -> Any:
-        if self.cfg.trainer.precision != "auto":
-            return self.cfg.trainer.precision
-        return "bf16-mixed" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "32-true"

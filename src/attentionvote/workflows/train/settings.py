@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
 from attentionvote.command.configuration import VerbSettings
@@ -11,10 +11,13 @@ from attentionvote.command.identity import NETWORK
 from attentionvote.command.sections import EXECUTOR, SEED, Cluster, Tracking
 from attentionvote.data.settings import DataSettings
 from attentionvote.model.settings import NetworkSettings
-from attentionvote.section import Target
-from attentionvote.setting import Setting, SettingError
+from attentionvote.section import Factory, Target
+from attentionvote.setting import Identity, Setting, SettingError
 from attentionvote.simulation.scene_spec import SimulationSettings
+from attentionvote.training.schedule import RateSchedule
 from attentionvote.training.settings import Loss, TrainerSettings
+
+HOW = Setting("", identity=Identity.NEVER)  # sections that say how the work is done
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,20 +31,51 @@ class TrainSettings(VerbSettings):
     model: NetworkSettings
     loss: Loss
     trainer: TrainerSettings
-    cluster: Cluster
+    optimizer: Annotated[
+        Factory | None,
+        Setting("Its class by _target_, and its arguments; null = trainer.optimizer.", identity=Identity.CHANGED),
+    ] = None
+    schedule: Annotated[
+        RateSchedule | None,
+        Setting("Of the learning rate, by _target_; null = trainer.schedule's.", identity=Identity.CHANGED),
+    ] = None
+    callbacks: Annotated[
+        dict[str, Target], Setting("Lightning's or yours, each by _target_.", identity=Identity.CHANGED)
+    ] = field(default_factory=dict)
+    loggers: Annotated[dict[str, Target], Setting("Beside MLflow, each by _target_.", identity=Identity.NEVER)] = field(
+        default_factory=dict
+    )
+    init: Annotated[
+        str | None,
+        Setting(
+            "Weights to begin with: a .ckpt file, an MLflow run, or models:/NAME@champion; null = random.",
+            identity=Identity.CHANGED,
+        ),
+    ] = None
+    cluster: Annotated[Cluster, HOW]
     seed: Annotated[int, SEED]
-    root: Annotated[str, Setting("Where scene sets and clouds lie.")]
-    outputs: Annotated[str, Setting("Where trainings lie.")]
+    root: Annotated[str, Setting("Where scene sets and clouds lie.", identity=Identity.NEVER)]
+    outputs: Annotated[str, Setting("Where trainings lie.", identity=Identity.NEVER)]
     resume: Annotated[
-        str, Setting("auto: go on with an interrupted training; never: start anew.", choices=("auto", "never"))
+        str,
+        Setting(
+            "auto: go on with an interrupted training; never: start anew.",
+            choices=("auto", "never"),
+            identity=Identity.NEVER,
+        ),
     ]
-    force: Annotated[bool, Setting("Repeat a training that is complete.")]
+    force: Annotated[bool, Setting("Repeat a training that is complete.", identity=Identity.NEVER)]
     workers: Annotated[
         int | None,
-        Setting("Processes for generation and clouds; null = one per core of this machine.", low=1, high=1024),
+        Setting(
+            "Processes for generation and clouds; null = one per core of this machine.",
+            low=1,
+            high=1024,
+            identity=Identity.NEVER,
+        ),
     ]
     executor: Annotated[str, EXECUTOR]
-    tracking: Tracking
+    tracking: Annotated[Tracking, HOW]
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:

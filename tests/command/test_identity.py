@@ -1,0 +1,68 @@
+"""What identifies a training: today's, and those of before."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from attentionvote.command.configuration import compose
+from attentionvote.command.identity import identifies, identity
+from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.settings import TrainSettings
+
+
+def of(*words: str, once: bool = False) -> str:
+    return json.dumps(identity(compose(TrainSettings, ["object=brick", *words]), once=once), sort_keys=True)
+
+
+def test_how_the_work_is_done_makes_no_other_training() -> None:
+    how = [
+        "root=x", "outputs=x", "resume=never", "force=true", "workers=3", "executor=ray", "cluster.gpus=1",
+        "tracking.parent=x", "data.workers=2", "trainer.threads=2", "trainer.profiler=simple", "loggers=csv",
+        "trainer.accumulate_grad_batches=1", "trainer.fast_dev_run=false", "init=null", "callbacks=[]",
+    ]  # fmt: skip
+    assert of(*how) == of()
+    assert of(*how, once=True) == of(once=True)
+
+
+def test_what_was_part_of_it_once_is_none_any_more() -> None:
+    words = ["trainer.log_every_steps=3", "object.title=Brick"]
+    assert of(*words) == of()
+    assert len({of(*some, once=True) for some in ([], words[:1], words[1:])}) == 3
+
+
+def test_what_changes_the_result_makes_another() -> None:
+    words = [
+        "trainer.validate_every=2", "trainer.accumulate_grad_batches=2", "trainer.limit_train_batches=0.5", "seed=1",
+        "trainer.fast_dev_run=true", "trainer.deterministic=true", "callbacks=early_stopping", "model.refinement=null",
+        "optimizer._target_=torch.optim.SGD",
+        "schedule._target_=torch.optim.lr_scheduler.ExponentialLR schedule.gamma=1",
+    ]  # fmt: skip
+    assert len({of(*word.split()) for word in words} | {of()}) == len(words) + 1
+
+
+def test_a_setting_says_whether_it_identifies() -> None:
+    for name in ("seed", "trainer.learning_rate", "trainer.validate_every", "model.refinement.points"):
+        assert identifies(TrainSettings, name)
+    for name in ("root", "tracking.store", "cluster.slurm.folder", "trainer.threads", "trainer.log_every_steps"):
+        assert not identifies(TrainSettings, name)
+
+
+# Folders of trainings by version 0.1 and 0.2 at their first day, computed by those.
+OF_BEFORE = {
+    "object=brick": "07c4fb994275",
+}
+
+
+@pytest.mark.parametrize(("words", "digest"), OF_BEFORE.items())
+def test_a_training_of_before_is_found_where_it_lies(words: str, digest: str, tmp_path: Path) -> None:
+    def folder(*more: str) -> Any:
+        return find_training(compose(TrainSettings, [*words.split(), f"outputs={tmp_path}", *more])).directory
+
+    assert folder().name != digest
+    (tmp_path / "brick" / digest).mkdir(parents=True)
+    assert folder() == tmp_path / "brick" / digest
+    assert folder("seed=1").name != digest
