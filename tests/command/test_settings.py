@@ -136,7 +136,8 @@ def test_every_number_has_bounds_on_both_sides_and_beyond_them_a_sentence(verb: 
         ("+model._target_=mine.Network",
          "model._target_ must be left out or attentionvote.model.AttentionVote; got 'mine.Network'"),
         ("model.centers=[512,256]", "model.centers must have 4 entries, one a level; got [512, 256]"),
-        ("object.symmetry=3", "object.symmetry must be a section with keys kind, axis, order, flip, flip_axis, quaternions; got 3"),
+        ("object.symmetry=3",
+         "object.symmetry must be a section with keys kind, axis, order, flip, flip_axis, quaternions; got 3"),
     ],
 )  # fmt: skip
 def test_an_impossible_value_is_one_sentence(words: str, sentence: str) -> None:

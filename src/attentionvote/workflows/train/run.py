@@ -236,7 +236,13 @@ class TrainingRun:
         if self.cfg.trainer.dev_batches:
             return ""
         if self.job.shorter is not None and self.cfg.resume != "never" and not self.cfg.force:
-            take_over(self.job.shorter, self.job.directory)
+            if self.cfg.goes_on_exactly:
+                take_over(self.job.shorter, self.job.directory)
+            else:
+                log.info(
+                    "trained anew, because the learning rate and callbacks of %s went by its own number of epochs; "
+                    "init=%s would begin with its weights", self.job.shorter, self.job.shorter,
+                )  # fmt: skip
         return str(usable_checkpoint(files, shapes) or "")
 
     def _track(self, tracked: Any) -> None:

@@ -77,6 +77,11 @@ class TrainSettings(VerbSettings):
     executor: Annotated[str, EXECUTOR]
     tracking: Annotated[Tracking, HOW]
 
+    @property
+    def goes_on_exactly(self) -> bool:
+        """Whether fewer epochs are the beginning of this training, to the bit: nothing looks ahead to its end."""
+        return self.trainer.schedule.shape != "cosine" and self.schedule is None and not self.callbacks
+
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:
         """Settings of plain containers; the class that files of conf/model named before 0.2 may stand there.
