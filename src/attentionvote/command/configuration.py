@@ -50,9 +50,11 @@ class VerbSettings:
         verb: stem of the configuration file.
         composed: plain containers as Hydra composed them, every interpolation resolved: what identities are made of.
         words: they were composed of.
+        elsewhere: what to say of names that people look for and that are no settings here.
     """
 
     verb: ClassVar[str]
+    elsewhere: ClassVar[Mapping[str, str]] = {}
     composed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     words: tuple[str, ...] = field(default=(), init=False, repr=False, compare=False)
 
@@ -102,6 +104,11 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
     group_words = [o for o in parsed if o.input_line and is_group(o.key_or_group, conf)]
     for override in group_words:
         _check_choice(override, conf)
+    for override in parsed:
+        name_alone = override.key_or_group.rpartition(".")[2]
+        if name_alone in settings.elsewhere and not _has_default(settings, override.key_or_group, {}):
+            hint = settings.elsewhere[name_alone]
+            raise ConfigurationError(f"there is no setting {override.key_or_group!r}: {hint}")
     words = list(overrides)
     if len(group_words) < len(parsed):
         base = _defaults(name, tuple(str(o.input_line) for o in group_words), conf, _state(conf))

@@ -25,6 +25,23 @@ class TrainSettings(VerbSettings):
     """What determines a training, and how it is run."""
 
     verb: ClassVar[str] = "train"
+    elsewhere: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(
+            ("devices", "num_nodes", "strategy"), "several processes share a training by `make train PROCESSES=2`"
+        ),
+        **dict.fromkeys(
+            ("ckpt_path", "resume_from_checkpoint", "pretrained"),
+            "the same command goes on with an interrupted training, init=FILE begins with the weights of another",
+        ),
+        "logger": "MLflow is always there, another is loggers.NAME._target_=CLASS or loggers=csv",
+        "limit_test_batches": "the test set is tested whole, simulation.cycles.test makes it smaller",
+        "limit_predict_batches": "a training does not predict",
+        "gradient_clip_val": "trainer.gradient_clip is the largest norm of the gradient",
+        "check_val_every_n_epoch": "trainer.validate_every is the number of epochs between validations",
+        "log_every_n_steps": "trainer.log_every_steps is the number of steps between logged losses",
+        "lr": "trainer.learning_rate is the learning rate at its highest",
+        "scheduler": "schedule._target_=CLASS names a schedule of the learning rate",
+    }
     object: Target
     simulation: SimulationSettings
     data: DataSettings
