@@ -22,6 +22,11 @@ TO ?=
 DIR ?=
 ARGS ?=
 PYTEST_ARGS ?=
+# A folder of your own with configuration files, and modules that they name (docs/variants.md).
+CONF ?=
+ifneq ($(CONF),)
+export ATTENTIONVOTE_CONF := $(abspath $(CONF))
+endif
 object := $(if $(OBJECT),object=$(OBJECT))
 # Of one training, each with a GPU of its own (docs/several-processes.md).
 PROCESSES ?=

@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from attentionvote.command.conf_folder import new_file
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import whole, write_whole
@@ -23,7 +24,8 @@ NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 def run(cfg: PartSettings) -> dict[str, Any]:
     """Write mesh, picture and, last, the configuration; the figures and the paths."""
-    name, config = _checked_name(cfg), Path(cfg.objects) / f"{cfg.name}.yaml"
+    name = _checked_name(cfg)
+    config = new_file("object", name) if cfg.objects is None else Path(cfg.objects) / f"{name}.yaml"
     if not cfg.mesh:
         raise ConfigurationError("mesh must be given, e.g. mesh=widget.stl")
     if config.exists() and not cfg.force:

@@ -37,11 +37,13 @@ class ChoicesOf:
     Args:
         module, name: the collection that lists them.
         shipped: some that are known to be among them; only another value is looked up there.
+        classes: whether the dotted name of a class of the user's is a choice too.
     """
 
     module: str
     name: str
     shipped: tuple[str, ...]
+    classes: bool = False
 
     def all(self) -> tuple[str, ...]:
         """Every choice; imports the module."""
@@ -158,6 +160,8 @@ def scalar_problem(value: Any, type_: Any, setting: Setting, nullable: bool) -> 
     choices = get_args(type_) if get_origin(type_) is Literal else setting.choices
     if choices:
         if isinstance(value, str) and value in (choices.shipped if isinstance(choices, ChoicesOf) else choices):
+            return ""
+        if isinstance(choices, ChoicesOf) and choices.classes and "." in str(value):
             return ""
         names = choices.all() if isinstance(choices, ChoicesOf) else choices
         return "" if value in names else f"one of {', '.join(names)}; got {value!r}{_near(str(value), names)}"

@@ -41,6 +41,11 @@ def add_folder(folder: str | Path, conf: Path = CONF) -> None:
     os.environ[VARIABLE] = str(path)
 
 
+def new_file(group: str, name: str) -> Path:
+    """Where a verb writes a file of a group: in the user's folder where there is one, else in the project's."""
+    return folders()[-1] / group / f"{name}.yaml"
+
+
 def see_modules() -> None:
     """Let ``_target_`` name modules of the current folder and of the user's configuration folder."""
     ours = [os.getcwd(), *map(str, folders()[1:])]

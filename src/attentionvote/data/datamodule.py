@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import lightning as L
 import numpy as np
@@ -14,6 +14,15 @@ from attentionvote.data.augmentation import Augmentation
 from attentionvote.data.clouds import Clouds
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.model.neighborhoods import Layout
+from attentionvote.scene import Scene
+
+
+class Scenes(Protocol):
+    """Measured scenes by number, with normals: ``Clouds``, a list of ``Scene``, or a dataset class of the user's."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Scene: ...
 
 
 class CloudSamples(Dataset[Batch]):
@@ -24,11 +33,12 @@ class CloudSamples(Dataset[Batch]):
     """
 
     def __init__(
-        self, clouds: Clouds, points: int, layout: Layout, augmentation: Augmentation | None, seed: int
+        self, clouds: Scenes, points: int, layout: Layout, augmentation: Augmentation | None, seed: int
     ) -> None:
         self.clouds, self.points, self.layout = clouds, points, layout
         self.augmentation, self.seed = augmentation, seed
-        self.scenes = [i for i in range(len(clouds)) if clouds.count(i) >= 3]
+        count = clouds.count if isinstance(clouds, Clouds) else lambda i: len(clouds[i].points)
+        self.scenes = [i for i in range(len(clouds)) if count(i) >= 3]
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -77,7 +87,7 @@ class PartDataModule(L.LightningDataModule):
     """Training, validation and test batches of one part.
 
     Args:
-        train, val, test: measured clouds of scene sets that share no drop cycle.
+        train, val, test: measured scenes, of piles that share no drop cycle.
         points: N, points a sample.
         layout: of the network, for the neighbourhoods.
         batch_size: scenes a step, of all processes together.
@@ -93,9 +103,9 @@ class PartDataModule(L.LightningDataModule):
 
     def __init__(
         self,
-        train: Clouds,
-        val: Clouds,
-        test: Clouds,
+        train: Scenes,
+        val: Scenes,
+        test: Scenes,
         points: int,
         layout: Layout,
         batch_size: int,
@@ -113,9 +123,9 @@ class PartDataModule(L.LightningDataModule):
         self.test = CloudSamples(test, points, layout, None, seed)
         for name, samples in (("training", self.train), ("validation", self.val), ("test", self.test)):
             if not len(samples):
+                where = f" in {samples.clouds.directory}" if isinstance(samples.clouds, Clouds) else ""
                 raise ValueError(
-                    f"the {name} scenes must have points, but all {len(samples.clouds)} clouds in "
-                    f"{samples.clouds.directory} are empty"
+                    f"the {name} scenes must have points, but all {len(samples.clouds)} clouds{where} are empty"
                 )
             if len(samples) < processes:
                 raise ValueError(f"processes must be at most the {len(samples)} {name} scenes, got {processes}")

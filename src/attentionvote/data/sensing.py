@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
-from attentionvote.scene import Scene
+from attentionvote.scene import BACKGROUND, Scene
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 from attentionvote.simulation.sensor import Sensor, synthesize
@@ -37,6 +40,11 @@ class CloudSettings:
         if not 1 <= self.pool <= self.density:
             raise ValueError(f"pool must lie in 1..{self.density} (density), got {self.pool}")
 
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Self:
+        """Those that a checkpoint keeps as plain values."""
+        return cls(**{**stored, "sensor": Sensor(**stored["sensor"])})
+
     def key(self, scene_digest: str) -> str:
         """Digest of everything that determines the stored clouds."""
         content = json.dumps([_VERSION, scene_digest, asdict(self)], sort_keys=True, default=str)
@@ -47,6 +55,22 @@ def sense(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> t
     """One scene as the sensor delivers it, up to ``density`` points, and the scene's own random numbers after it."""
     rng = np.random.default_rng(np.random.SeedSequence(record.scene_seed))
     return synthesize(record, caster, settings.sensor, settings.density, rng), rng
+
+
+def unlabelled(points: NDArray[np.floating], density: int, rng: np.random.Generator) -> Scene:
+    """A cloud whose instances nobody knows, up to ``density`` points; rows that are not finite are missing.
+
+    Raises:
+        ValueError: when it is not ``(P, 3)`` or fewer than three points are left.
+    """
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (P, 3), got {points.shape}")
+    cloud = points[np.isfinite(points).all(axis=1)].astype(np.float32)
+    if len(cloud) < 3:
+        raise ValueError(f"points must hold at least 3 measured points, got {len(cloud)}")
+    cloud = cloud[sample_indices(len(cloud), min(density, len(cloud)), rng)]
+    no_one = np.full(len(cloud), BACKGROUND, np.int32)
+    return Scene(cloud, no_one, np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0, np.int32))
 
 
 def measure(record: SceneRecord, caster: PartCaster, settings: CloudSettings) -> Scene:

@@ -19,13 +19,6 @@ from attentionvote.model.neighborhoods import Layout
 from attentionvote.part import Parts
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_set import SceneSet
-from attentionvote.simulation.sensor import Sensor
-
-
-def cloud_settings(metadata: dict[str, Any]) -> CloudSettings:
-    """What the training measured of a scene, from a checkpoint's metadata."""
-    stored = dict(metadata["clouds"])
-    return CloudSettings(**(stored | {"sensor": Sensor(**stored["sensor"])}))
 
 
 def find_test_scenes(metadata: dict[str, Any], part: Parts, root: Path) -> SceneSet | DatasetSplit:

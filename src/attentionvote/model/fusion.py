@@ -10,8 +10,7 @@ MLP for the instance features; they differ in how the votes of a proposal become
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -19,8 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding  # a lookup; its gradient costs a third of an index's
 
 from attentionvote.model.layers import RowNorm, shared_mlp
-
-FusionKind = Literal["aml", "amx", "pn"]
+from attentionvote.section import located
 
 
 class VoteBranch(nn.Module):
@@ -132,3 +130,17 @@ FUSIONS: dict[str, type[AttentionVoting] | type[MatrixAttention] | type[PointNet
     "amx": MatrixAttention,
     "pn": PointNetPooling,
 }
+
+
+def fusion_class(kind: str) -> Callable[[int, Sequence[int]], nn.Module]:
+    """The class of a name in ``FUSIONS``, or of a dotted name: one of the user's that is built and called as they are.
+
+    Raises:
+        ValueError: when it is neither.
+    """
+    if kind in FUSIONS:
+        return FUSIONS[kind]
+    fusion = located(kind)
+    if not (isinstance(fusion, type) and issubclass(fusion, nn.Module)):
+        raise ValueError(f"model.fusion_kind must be one of {', '.join(FUSIONS)} or a class of nn.Module; got {kind!r}")
+    return fusion

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from attentionvote.model.backbone import Backbone
 from attentionvote.model.farthest_votes import FarthestVotes, farthest_vote_peaks
-from attentionvote.model.fusion import FUSIONS
+from attentionvote.model.fusion import fusion_class
 from attentionvote.model.layers import shared_mlp
 from attentionvote.model.neighborhoods import Layout, Neighborhoods, find_batch
 from attentionvote.model.precision import widened
@@ -104,7 +104,7 @@ class AttentionVote(nn.Module):
         # A module without weights: the exporter puts its own in its place.
         self.farthest = FarthestVotes() if settings.proposal_source == "fps" else None
         self.heatmap = Heatmap()
-        self.fusion = FUSIONS[settings.fusion_kind](width, settings.fusion)
+        self.fusion = fusion_class(settings.fusion_kind)(width, settings.fusion)
         self.head = shared_mlp(self.fusion.width, settings.head)
         self.channels = PoseChannels.of(rotation_size, settings.classes)
         self.output = nn.Linear(settings.head[-1], self.channels.width)

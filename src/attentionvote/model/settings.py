@@ -8,7 +8,7 @@ from typing import Annotated
 from attentionvote.section import check
 from attentionvote.setting import ChoicesOf, Setting, SettingError
 
-_FUSIONS = ChoicesOf("attentionvote.model.fusion", "FUSIONS", ("aml", "amx", "pn"))
+_FUSIONS = ChoicesOf("attentionvote.model.fusion", "FUSIONS", ("aml", "amx", "pn"), classes=True)
 Widths = tuple[int, ...]
 LEVELS = 4  # set abstractions of the backbone, with radii r, 2r, 3r and 6r
 

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import lightning as L
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from attentionvote.data.samples import Batch
+from attentionvote.data.samples import Batch, collate, draw_sample
+from attentionvote.data.sensing import CloudSettings, unlabelled, with_normals
 from attentionvote.evaluation import SceneResult, evaluate
 from attentionvote.model.network import AttentionVote
 from attentionvote.model.predictions import Predictions
 from attentionvote.part import Parts
 from attentionvote.section import Factory
 from attentionvote.training import processes
-from attentionvote.training.checkpoint import KEY
+from attentionvote.training.checkpoint import KEY, load_trained
 from attentionvote.training.detections import scene_results
 from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.optimization import optimizer_of, paper_rate
@@ -30,7 +34,7 @@ class PoseTraining(L.LightningModule):
 
     Args:
         model: the network.
-        loss: its losses.
+        loss: its losses; None of a loaded module, which only answers (so the next two).
         part: for the metrics; or the set of parts that the network's classes are.
         schedule: learning rate and warm-up.
         optimizer: ``adam`` (the paper's), ``adamw`` or another.
@@ -44,9 +48,9 @@ class PoseTraining(L.LightningModule):
     def __init__(
         self,
         model: AttentionVote,
-        loss: AttentionVoteLoss,
-        part: Parts,
-        schedule: Schedule,
+        loss: AttentionVoteLoss | None,
+        part: Parts | None,
+        schedule: Schedule | None,
         optimizer: str | Factory = "adam",
         learning_rate: float = 1e-3,
         weight_decay: float = 0.0,
@@ -56,7 +60,7 @@ class PoseTraining(L.LightningModule):
         rate_schedule: RateSchedule | None = None,
     ) -> None:
         super().__init__()
-        if model.classes != len(part.parts):
+        if part is not None and model.classes != len(part.parts):
             raise ValueError(
                 f"model.classes must be the number of parts of {part.name} ({len(part.parts)}), got {model.classes}"
             )
@@ -68,8 +72,21 @@ class PoseTraining(L.LightningModule):
         self.voting_radius = model.voting_radius
         self.results: list[SceneResult] = []
 
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Path | str, **_: Any) -> Self:  # type: ignore[override]
+        """A trained module of ``model.ckpt`` or of any checkpoint of its training, for answers alone.
+
+        Raises:
+            ValueError, FileNotFoundError: see ``checkpoint.load_trained``.
+        """
+        model, metadata = load_trained(checkpoint_path)
+        module = cls(model, None, None, None, peak_threshold=metadata["peak_threshold"], metadata=metadata)
+        return module.eval()
+
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """One step; logs every term of the loss under ``train/loss/``."""
+        assert self.loss is not None, "a loaded module answers and does not train"
+        assert self.schedule is not None
         ramp = self.schedule.ramp(self.global_step)
         self.model.voting_radius = self.voting_radius * (self.schedule.vote_radius_factor if ramp < 1 else 1.0)
         terms = batch_loss(self.model, self.loss, batch, ramp, self.train_heat)
@@ -93,6 +110,7 @@ class PoseTraining(L.LightningModule):
 
         Of several parts the mean over the parts, and each part's own.
         """
+        assert self.part is not None
         results = processes.in_order(self.results)
         metrics = processes.from_first(evaluate(results, self.part, add=False) if processes.rank() == 0 else {})
         self.log_dict({f"val/{k}": v for k, v in metrics.items()})
@@ -115,8 +133,30 @@ class PoseTraining(L.LightningModule):
         """Detections of a batch beside its truth."""
         return scene_results(self.predict(batch), batch, self.peak_threshold)
 
+    def predict_step(self, batch: Batch, _: int = 0) -> list[SceneResult]:
+        """``detect``, for ``Trainer.predict``."""
+        return self.detect(batch)
+
+    def poses(self, points: NDArray[np.floating], seed: int = 0) -> SceneResult:
+        """Every instance in a cloud, as a cell finds it: ``poses`` (camera_from_part, metres) and ``scores``.
+
+        Args:
+            points: ``(P, 3)`` camera frame, metres; rows that are not finite are missing.
+            seed: of the choice of points.
+
+        Raises:
+            ValueError: when fewer than three points are left.
+        """
+        settings, rng = CloudSettings.of(self.metadata["clouds"]), np.random.default_rng(seed)
+        scene = with_normals(unlabelled(points, settings.density, rng), rng, settings)
+        batch = collate([draw_sample(scene, int(self.metadata["points"]), self.model.layout, None, rng)])
+        threshold = self.metadata["confidence_threshold"] or 0.0
+        return scene_results(self.predict(batch), batch, self.peak_threshold, threshold)[0]
+
     def examine(self, batch: Batch) -> list[tuple[SceneResult, ProposalCounts]]:
         """``detect``, and how the proposals cover the instances within the radius of the loss's assignment."""
+        assert self.loss is not None
+        assert self.part is not None
         predictions = self.predict(batch)
         radius = [self.loss.settings.assignment * part.diameter for part in self.part.parts]
         counts = proposal_counts(predictions, batch, self.peak_threshold, radius)
@@ -130,6 +170,7 @@ class PoseTraining(L.LightningModule):
         if self.rate_schedule is not None:
             every = self.trainer.check_val_every_n_epoch or 1
             return {"optimizer": optimizer, "lr_scheduler": self.rate_schedule.configured(optimizer, total, every)}
+        assert self.schedule is not None
         per_epoch = max(1, -(-int(self.trainer.num_training_batches) // self.trainer.accumulate_grad_batches))
         return {"optimizer": optimizer, "lr_scheduler": paper_rate(self.schedule, optimizer, total, per_epoch)}
 

@@ -116,6 +116,7 @@ class ExportJob:
         Raises:
             ValueError: when the checkpoint, the part or the held-out scenes are not what they were.
         """
+        from attentionvote.data.sensing import CloudSettings
         from attentionvote.export import held_out
         from attentionvote.export.checkpoint_card import model_card, used_otherwise
         from attentionvote.training.checkpoint import load_trained
@@ -124,7 +125,7 @@ class ExportJob:
         metadata = used_otherwise(model, metadata, self.cfg.voting_radius, self.cfg.peak_threshold)
         root = Path(self.cfg.root)
         scenes = held_out.find_test_scenes(metadata, self.part, root)
-        settings = held_out.cloud_settings(metadata)
+        settings = CloudSettings.of(metadata["clouds"])
         clouds = held_out.measured(scenes, self.part, settings, root, self.cfg.workers or cores())
         indices = [i for i in held_out.spread(len(clouds), self.cfg.scenes) if clouds.count(i) >= 3]
         if len(indices) < self.cfg.limits.scenes:

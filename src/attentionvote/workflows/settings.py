@@ -151,7 +151,10 @@ class PartSettings(VerbSettings):
     ]
     force: Annotated[bool, Setting("Replace an object of the same name.")]
     parts: Annotated[str, Setting("Where the mesh in the part frame and its picture go.")]
-    objects: Annotated[str, Setting("Where the object's configuration goes.")]
+    objects: Annotated[
+        str | None,
+        Setting("Where the object's configuration goes; null = object/ in the folder of CONF=, else in conf/."),
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from optuna.trial import FrozenTrial, TrialState
 
-from attentionvote.command.conf_folder import CONF
+from attentionvote.command.conf_folder import new_file
 from attentionvote.files import write_whole
 from attentionvote.workflows.sweep.report import experiment_text, importances, run_of, write_table
 from attentionvote.workflows.sweep.study import Ledger
@@ -78,7 +78,7 @@ def report(
     text = experiment_text(base, values, title)
     paths = [folder / "best.yaml", folder.parent / "best.yaml"]
     if save_as:
-        paths.append(CONF / "experiment" / f"{save_as}.yaml")
+        paths.append(new_file("experiment", save_as))
     for path in paths:
         write_whole(path, text)
     parent.log_file("best.yaml", paths[0])

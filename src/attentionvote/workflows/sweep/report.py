@@ -16,7 +16,7 @@ from optuna.exceptions import OptunaError
 from optuna.importance import get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from attentionvote.command.conf_folder import CONF, is_group
+from attentionvote.command.conf_folder import is_group, new_file
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.command.identity import identifies
 from attentionvote.command.words import parse
@@ -129,7 +129,7 @@ def _put(settings: dict[str, Any], key: str, value: Any) -> None:
     settings[leaf] = value
 
 
-def check_save_as(name: str | None, experiments: Path = CONF / "experiment", words: Sequence[str] = ()) -> None:
+def check_save_as(name: str | None, experiments: Path | None = None, words: Sequence[str] = ()) -> None:
     """Refuse a name that is no file name, that is a file of the user's, or that the experiment of the words builds on.
 
     Raises:
@@ -139,6 +139,7 @@ def check_save_as(name: str | None, experiments: Path = CONF / "experiment", wor
         return
     if not re.fullmatch(r"[\w-]+", name, re.ASCII):
         raise ConfigurationError(f"save_as must be a name of letters, digits, - and _, got {name!r}")
+    experiments = experiments or new_file("experiment", name).parent
     path = experiments / f"{name}.yaml"
     if path.exists() and MARK not in path.read_text(encoding="utf-8"):
         raise ConfigurationError(

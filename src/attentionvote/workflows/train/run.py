@@ -5,33 +5,26 @@ from __future__ import annotations
 import json
 import logging
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
 
-from attentionvote import __version__
 from attentionvote.command.executors import executor_of
-from attentionvote.data.clouds import Clouds
 from attentionvote.data.datamodule import PartDataModule
-from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution.hardware import cores
 from attentionvote.files import write_json
-from attentionvote.model.network import AttentionVote
 from attentionvote.tracking.store import connect, resolve_store
-from attentionvote.training.checkpoint import FORMAT, usable_checkpoint
+from attentionvote.training.checkpoint import usable_checkpoint
 from attentionvote.training.checkpoint_writer import AtomicCheckpoints
-from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.messages import plain_loader_errors, quiet_lightning
-from attentionvote.training.module import PoseTraining
 from attentionvote.training.pictures import ScenePictures
 from attentionvote.training.progress import TrainingProgress
 from attentionvote.workflows.train.beginning import checkpoint_of, take_over, take_weights
 from attentionvote.workflows.train.data import prepare_data
 from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
-from attentionvote.workflows.train.network import described, network_arguments
+from attentionvote.workflows.train.pieces import cloud_settings, data_module, pose_training
 from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
 from attentionvote.workflows.train.results import SplitDetections, assess, best_score, detect_everything, log_losses
 from attentionvote.workflows.train.settings import TrainSettings
@@ -55,40 +48,10 @@ class TrainingRun:
     def __init__(self, cfg: TrainSettings, job: TrainingJob, process: TrainingProcess, first_does: FirstDoes) -> None:
         self.cfg, self.job, self.part = cfg, job, job.part
         self.process, self.first_does = process, first_does
-        part, t = job.part, cfg.trainer
         L.seed_everything(cfg.seed, verbose=False)
-        self.threads = t.threads or process.cores
+        self.threads = cfg.trainer.threads or process.cores
         torch.set_num_threads(self.threads)
-        arguments = network_arguments(cfg.model, part)
-        model = AttentionVote.from_arguments(arguments)
-        loss = AttentionVoteLoss(part, asdict(cfg.loss.weights), cfg.loss.settings)
-        self.clouds = CloudSettings(cfg.data.sensor, cfg.data.density, cfg.data.pool, cfg.data.normal_neighbors)
-        metadata = {
-            "format": FORMAT,
-            "version": __version__,
-            "model": arguments,
-            **described(part),
-            "points": cfg.data.points,
-            "clouds": asdict(self.clouds),
-            "peak_threshold": t.peak_threshold,
-            "confidence_threshold": None,
-            "data": {},
-            "test": {},
-        }
-        self.module = PoseTraining(
-            model,
-            loss,
-            part,
-            t.schedule,
-            cfg.optimizer or t.optimizer,
-            t.learning_rate,
-            t.weight_decay,
-            t.peak_threshold,
-            t.train_heat,
-            json.loads(json.dumps(metadata)),  # plain values only: what torch.load(weights_only=True) accepts
-            cfg.schedule,
-        )
-        self.augmentation = cfg.data.augmentation
+        self.clouds, self.module = cloud_settings(cfg), pose_training(cfg, job.part)
         self.workers = cfg.workers or cores()
         self.progress, self.pictures, self.checkpoint_files = TrainingProgress(), ScenePictures(), AtomicCheckpoints()
         with quiet_lightning():
@@ -113,7 +76,7 @@ class TrainingRun:
             self.module.metadata["dataset"] = self.job.dataset.described()
         data_seconds = time.monotonic() - start
         with plain_loader_errors(), quiet_lightning():
-            data = self._data_module(clouds)
+            data = data_module(self.cfg, self.module, clouds["train"], clouds["val"], clouds["test"], self.process)
             if self.process.rank:
                 self._fit(data, None)
                 if not self.cfg.trainer.dev_batches:
@@ -197,22 +160,6 @@ class TrainingRun:
             f" in each of {self.process.processes} processes" if self.process.processes > 1 else "",
             ", going on after an interruption" if self.job.run_id else "",
         )  # fmt: skip
-
-    def _data_module(self, clouds: dict[str, Clouds]) -> PartDataModule:
-        cfg = self.cfg
-        return PartDataModule(
-            clouds["train"],
-            clouds["val"],
-            clouds["test"],
-            cfg.data.points,
-            self.module.model.layout,
-            cfg.trainer.batch_size,
-            cfg.data.workers,
-            self.augmentation,
-            cfg.seed,
-            self.process.rank,
-            self.process.processes,
-        )
 
     def _fit(self, data: PartDataModule, tracked: Any | None) -> TrainingProgress:
         """Train to the end, from wherever an earlier call came to; only the first process tracks."""
