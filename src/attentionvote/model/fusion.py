@@ -10,7 +10,8 @@ MLP for the instance features; they differ in how the votes of a proposal become
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -132,7 +133,7 @@ FUSIONS: dict[str, type[AttentionVoting] | type[MatrixAttention] | type[PointNet
 }
 
 
-def fusion_class(kind: str) -> Callable[[int, Sequence[int]], nn.Module]:
+def fusion_class(kind: str) -> type[Any]:
     """The class of a name in ``FUSIONS``, or of a dotted name: one of the user's that is built and called as they are.
 
     Raises:

@@ -65,7 +65,11 @@ class PoseTraining(L.LightningModule):
                 f"model.classes must be the number of parts of {part.name} ({len(part.parts)}), got {model.classes}"
             )
         self.metadata = dict(metadata or {})
-        self.model, self.loss, self.part, self.schedule = model, loss, part, schedule
+        self.model = model
+        # None of a loaded module, which only answers: see configure_optimizers.
+        self.loss: AttentionVoteLoss = loss  # type: ignore[assignment]
+        self.part: Parts = part  # type: ignore[assignment]
+        self.schedule: Schedule = schedule  # type: ignore[assignment]
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.peak_threshold, self.train_heat = peak_threshold, train_heat
         self.rate_schedule = rate_schedule
@@ -85,8 +89,6 @@ class PoseTraining(L.LightningModule):
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         """One step; logs every term of the loss under ``train/loss/``."""
-        assert self.loss is not None, "a loaded module answers and does not train"
-        assert self.schedule is not None
         ramp = self.schedule.ramp(self.global_step)
         self.model.voting_radius = self.voting_radius * (self.schedule.vote_radius_factor if ramp < 1 else 1.0)
         terms = batch_loss(self.model, self.loss, batch, ramp, self.train_heat)
@@ -110,7 +112,6 @@ class PoseTraining(L.LightningModule):
 
         Of several parts the mean over the parts, and each part's own.
         """
-        assert self.part is not None
         results = processes.in_order(self.results)
         metrics = processes.from_first(evaluate(results, self.part, add=False) if processes.rank() == 0 else {})
         self.log_dict({f"val/{k}": v for k, v in metrics.items()})
@@ -155,22 +156,25 @@ class PoseTraining(L.LightningModule):
 
     def examine(self, batch: Batch) -> list[tuple[SceneResult, ProposalCounts]]:
         """``detect``, and how the proposals cover the instances within the radius of the loss's assignment."""
-        assert self.loss is not None
-        assert self.part is not None
         predictions = self.predict(batch)
         radius = [self.loss.settings.assignment * part.diameter for part in self.part.parts]
         counts = proposal_counts(predictions, batch, self.peak_threshold, radius)
         return list(zip(scene_results(predictions, batch, self.peak_threshold), counts, strict=True))
 
     def configure_optimizers(self) -> Any:
-        """The optimizer and its learning rate (``training.optimization``)."""
+        """The optimizer and its learning rate (``training.optimization``).
+
+        Raises:
+            ValueError: of a module that was loaded.
+        """
+        if self.loss is None:
+            raise ValueError("a loaded module only answers: a training begins with its weights by init=FILE")
         fused = str(self.trainer.precision).endswith("-true")
         optimizer = optimizer_of(self.optimizer, self.parameters(), self.learning_rate, self.weight_decay, fused=fused)
         total = int(self.trainer.estimated_stepping_batches)
         if self.rate_schedule is not None:
             every = self.trainer.check_val_every_n_epoch or 1
             return {"optimizer": optimizer, "lr_scheduler": self.rate_schedule.configured(optimizer, total, every)}
-        assert self.schedule is not None
         per_epoch = max(1, -(-int(self.trainer.num_training_batches) // self.trainer.accumulate_grad_batches))
         return {"optimizer": optimizer, "lr_scheduler": paper_rate(self.schedule, optimizer, total, per_epoch)}
 
