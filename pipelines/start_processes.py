@@ -4,7 +4,8 @@
     .venv/bin/python pipelines/start_processes.py --standalone --nproc-per-node=8 pipelines/train.py object=gear
 
 Takes torchrun's arguments and does what torchrun does. When a process fails, its own sentence is the last word instead
-of torchrun's traceback, and its exit code is kept: 2 for an impossible configuration, 130 for Ctrl-C.
+of torchrun's traceback, and its exit code is kept: 2 for an impossible configuration, 130 for Ctrl-C, 143
+for SIGTERM.
 """
 
 from __future__ import annotations

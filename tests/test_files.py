@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import pickle
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
 import pytest
+from real_disks import read_only, small_disk
 
 from attentionvote.files import (
+    DiskFull,
     FolderUnavailable,
     cache_folder,
+    disk_full,
     is_locked,
     locked_folder,
+    naming_full_disk,
     read_json,
     remove_leftovers,
     waiting_lock,
@@ -118,3 +124,62 @@ def test_one_cache_folder_for_everything(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setenv("ATTENTIONVOTE_CACHE", "/y")
     assert cache_folder() == Path("/y")
     assert os.environ["ATTENTIONVOTE_CACHE"] == "/y"
+
+
+FULL = (
+    r"^the disk of {} must have room, but [\d,]+ bytes are free \({}\): make room, the same command goes on from there$"
+)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_a_sentence_with_the_folder(tmp_path: Path, number: int) -> None:
+    def full(_: Path) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with pytest.raises(DiskFull, match=FULL.format(tmp_path, os.strerror(number))) as error:
+        whole(tmp_path / "a", full)
+    assert error.value.errno == number
+    again = pickle.loads(pickle.dumps(error.value))  # of a worker
+    assert (type(again), str(again)) == (DiskFull, str(error.value))
+    assert disk_full(again) is again
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_errors_are_left_as_they_are(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError), naming_full_disk(tmp_path):
+        tmp_path.write_text("")
+    assert disk_full(OSError("disk full")) is None
+    assert disk_full(ValueError("28")) is None
+
+
+def test_the_folder_is_the_one_that_the_error_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "outputs").mkdir()
+    number, text = errno.ENOSPC, os.strerror(errno.ENOSPC)
+    named = [
+        (OSError(number, text, str(tmp_path / "to" / "f")), tmp_path / "to"),
+        (OSError(number, text, "/from/f", None, str(tmp_path / "to" / "f")), tmp_path / "to"),  # of a copy
+        (RuntimeError("(sqlite3.OperationalError) database or disk is full\n[SQL: ...]"), "outputs"),
+    ]
+    for error, folder in named:
+        assert f"the disk of {folder} must have room" in str(disk_full(error))
+
+
+def test_a_disk_that_is_really_full(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", "64k") as disk:
+        write_whole(disk / "before", "here")
+        with pytest.raises(DiskFull, match=FULL.format(disk / "deep", "No space left on device")):
+            write_whole(disk / "deep" / "a", "x" * 100_000)
+        assert sorted(path.name for path in disk.rglob("*")) == ["before", "deep"]
+        (disk / "rest").write_bytes(b"x" * 56 * 1024)
+        for folder in (disk / "new", disk / "deep"):  # inodes need no room on this file system
+            with locked_folder(folder, "x", "training"), waiting_lock(folder / "b"):
+                pass
+
+
+def test_a_place_for_reading_only_is_one_sentence(tmp_path: Path) -> None:
+    with read_only(tmp_path):
+        refused = pytest.raises(FolderUnavailable, match=rf"^{tmp_path} cannot be written: Read-only file system$")
+        with refused, waiting_lock(tmp_path / ".lock"):
+            pass
+        assert not is_locked(tmp_path)

@@ -1,12 +1,18 @@
-"""Files and folders that survive a kill: written whole or not at all, one process a folder, one cache folder."""
+"""Files and folders that survive a kill: written whole or not at all, one process a folder, one cache folder.
+
+Where something lies whole already nothing is written: a reader needs no right to write, and no room.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +23,82 @@ class FolderUnavailable(ValueError):
     """A folder for results cannot be written, or another process works in it; the message is one sentence."""
 
 
+class DiskFull(OSError):
+    """A disk has no room left; the message is one sentence with a folder on it."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+def disk_full(error: BaseException, folder: Path | None = None) -> DiskFull | None:
+    """The error of a full disk, or of a used-up quota, that this exception tells of; None when it tells of another.
+
+    Args:
+        error: by the system, or by SQLite, however it is wrapped.
+        folder: that was written to; None: the one that ``error`` names, else the fullest of those that may be meant.
+    """
+    number = error.errno if isinstance(error, OSError) else None
+    by_database = "database or disk is full" in str(error)
+    if number not in (errno.ENOSPC, errno.EDQUOT) and not by_database:
+        return None
+    if isinstance(error, DiskFull):
+        return error
+    if folder is None and isinstance(error, OSError) and (error.filename2 or error.filename):
+        folder = Path(os.fsdecode(error.filename2 or error.filename)).parent
+    if folder is None:
+        places = [Path(name) for name in ("outputs", "data", ".", tempfile.gettempdir())]
+        folder = min(filter(Path.is_dir, places), key=_free_bytes)
+    number = number or errno.ENOSPC
+    free = _free_bytes(folder)
+    return DiskFull(
+        number,
+        f"the disk of {folder} must have room, but {free:,} bytes are free ({os.strerror(number)}): make room, the "
+        "same command goes on from there",
+    )
+
+
+def _free_bytes(folder: Path) -> int:
+    """Room for this user on the disk of a folder that may not exist yet."""
+    there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    return shutil.disk_usage(there).free
+
+
+@contextmanager
+def naming_full_disk(folder: Path) -> Iterator[None]:
+    """Around what writes to a folder.
+
+    Raises:
+        DiskFull: instead of the system's error, which names no folder.
+    """
+    try:
+        yield
+    except OSError as error:
+        full = disk_full(error, folder)
+        if full is None or full is error:
+            raise
+        raise full from error
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write a text; its folder is made."""
     whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8", newline=""))
 
 
 def whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Have ``write`` make a file under another name of the same kind, and give it its own; its folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Have ``write`` make a file under another name of the same kind, and give it its own; its folder is made.
+
+    Raises:
+        DiskFull: when there is no room.
+    """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        write(temporary)
-        temporary.replace(path)
+        with naming_full_disk(path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary)
+            temporary.replace(path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a folder that was not made holds nothing
+            temporary.unlink(missing_ok=True)
 
 
 def remove_leftovers(path: Path) -> None:
@@ -80,12 +148,16 @@ def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs
 
     Raises:
         FolderUnavailable: when the folder cannot be written, or another process is in it.
+        DiskFull: when there is no room.
     """
     import fcntl  # of Unix; what only reads and writes needs no locks
 
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
+        with naming_full_disk(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = (folder / ".lock").open("w")
+    except DiskFull:
+        raise
     except OSError as error:
         raise FolderUnavailable(f"{setting}={outputs} cannot be written: {error.strerror or error}") from error
     with lock:
@@ -98,11 +170,23 @@ def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs
 
 @contextmanager
 def waiting_lock(path: Path) -> Iterator[None]:
-    """Wait until no other process holds this file, and hold it; its folder is made."""
+    """Wait until no other process holds this file, and hold it; its folder is made.
+
+    Raises:
+        FolderUnavailable: when its folder cannot be written.
+        DiskFull: when there is no room.
+    """
     import fcntl
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as lock:
+    try:
+        with naming_full_disk(path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = path.open("w")
+    except DiskFull:
+        raise
+    except OSError as error:
+        raise FolderUnavailable(f"{path.parent} cannot be written: {error.strerror or error}") from error
+    with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
         yield
 

@@ -166,11 +166,12 @@ def ends(pid: int) -> bool:
     return False
 
 
-def test_ctrl_c_ends_the_grid_and_its_job(verb: Path) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_ends_the_grid_and_its_job(verb: Path, number: int, code: int) -> None:
     process = started(verb)
-    process.send_signal(signal.SIGINT)  # to the grid alone, which passes it on
+    process.send_signal(number)  # to the grid alone, which passes it on
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == code
     assert len(out.splitlines()) == 1
     assert err.splitlines()[-1] == "fake: interrupted; run the same command to resume"
     assert "Traceback" not in err

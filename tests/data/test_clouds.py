@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from real_disks import read_only, resize, small_disk
 
 from attentionvote.data import cloud_pool
+from attentionvote.data import clouds as clouds_module
 from attentionvote.data.clouds import Clouds, measure_clouds
 from attentionvote.data.sensing import CloudSettings, measure
+from attentionvote.files import DiskFull, FolderUnavailable, waiting_lock
 from attentionvote.geometry.pose import apply
 from attentionvote.part import Part
 from attentionvote.scene import Scene
@@ -144,3 +148,38 @@ def test_damaged_clouds_are_named(scenes: SceneSet, box: Part, settings: CloudSe
     (clouds.directory / "points.npy").unlink()
     with pytest.raises(ValueError, match=r"points.npy must hold .*missing or damaged"):
         Clouds(clouds.directory, scenes)
+
+
+def test_complete_clouds_are_used_where_nothing_can_be_written(
+    clouds: Clouds, scenes: SceneSet, box: Part, settings: CloudSettings, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = measure_clouds(scenes, box, settings, folder, 1, progress=False)
+    (measured.directory / ".lock").unlink()
+    with read_only(folder):
+        assert bits(measure_clouds(scenes, box, settings, folder, 1, progress=False)) == bits(clouds)
+        other = CloudSettings(settings.sensor, settings.density, 599, settings.neighbors)
+        with pytest.raises(FolderUnavailable, match="cannot be written: Read-only file system"):
+            measure_clouds(scenes, box, other, folder, 1, progress=False)
+    monkeypatch.setattr(clouds_module, "waiting_lock", lambda *_: pytest.fail("a lock was written"))
+    measure_clouds(scenes, box, settings, folder, 1, progress=False)
+
+
+def test_clouds_that_another_process_is_at_are_waited_for(
+    scenes: SceneSet, box: Part, settings: CloudSettings, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = measure_clouds(scenes, box, settings, folder, 1, progress=False)
+    waited = []
+    with waiting_lock(measured.directory / ".lock"):
+        monkeypatch.setattr(clouds_module, "waiting_lock", lambda path: waited.append(path) or nullcontext())
+        measure_clouds(scenes, box, settings, folder, 1, progress=False)
+    assert waited == [measured.directory / ".lock"]
+
+
+def test_a_full_disk_is_named_and_the_clouds_go_on(
+    clouds: Clouds, scenes: SceneSet, box: Part, settings: CloudSettings, folder: Path
+) -> None:
+    with small_disk(folder / "disk", "40k") as disk:
+        with pytest.raises(DiskFull, match=rf"^the disk of {disk}/.* must have room"):
+            measure_clouds(scenes, box, settings, disk, 1, progress=False)
+        resize(disk, "1m")
+        assert bits(measure_clouds(scenes, box, settings, disk, 1, progress=False)) == bits(clouds)

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 import pytest
 
+from attentionvote.execution import hardware
 from attentionvote.execution.hardware import cores, gpu_of_slot, visible_gpus
 
 
-def limited(monkeypatch: pytest.MonkeyPatch, allowed: int, quota: str | None) -> int:
-    """Cores with a cpuset of ``allowed`` and a container's ``cpu.max`` of ``quota``."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(allowed)))
-
-    def read_text(path: Path, *_: object) -> str:
-        assert path == Path("/sys/fs/cgroup/cpu.max")
-        if quota is None:
-            raise FileNotFoundError(path)
-        return quota
-
-    monkeypatch.setattr(Path, "read_text", read_text)
-    return cores()
-
-
 @pytest.mark.parametrize(
-    ("allowed", "quota", "expected"),
-    [(8, None, 8), (8, "max 100000", 8), (8, "200000 100000", 2), (2, "800000 100000", 2), (4, "50000 100000", 1)],
+    ("allowed", "quota", "expected"), [(8, math.inf, 8), (8, 2.0, 2), (2, 8.0, 2), (8, 3.99, 3), (4, 0.5, 1)]
 )
 def test_the_smaller_of_cpuset_and_quota_counts(
-    monkeypatch: pytest.MonkeyPatch, allowed: int, quota: str | None, expected: int
+    monkeypatch: pytest.MonkeyPatch, allowed: int, quota: float, expected: int
 ) -> None:
-    assert limited(monkeypatch, allowed, quota) == expected
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(allowed)))
+    monkeypatch.setattr(hardware, "processor_quota", lambda: quota)
+    assert cores() == expected
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
+from real_disks import resize, small_disk
 
 from attentionvote.contract import ModelCard
 from attentionvote.export import bundle_writer
 from attentionvote.export.bundle_writer import write_bundle
 from attentionvote.export.triton_layout import write_triton
+from attentionvote.files import DiskFull
 from attentionvote.inference import PoseEstimator, load_bundle
 from attentionvote.part import Part
 
@@ -58,6 +60,15 @@ def test_the_same_content_has_the_same_name_and_another_card_another(write: Call
     first, again, other = write(), write(), write(evaluation={"ap_10": 0.9})
     assert first.digest == again.digest != other.digest
     assert load_bundle(first.path, KEY.public_key()).digest == first.digest
+
+
+def test_a_full_disk_is_named_and_nothing_half_written_stays(write: Callable, tmp_path: Path) -> None:
+    with small_disk(tmp_path / "brick", "100k") as disk:
+        with pytest.raises(DiskFull, match=rf"^the disk of {disk} must have room"):
+            write()
+        assert not list(disk.iterdir())
+        resize(disk, "100m")
+        assert (disk / "latest").resolve() == write().path
 
 
 def test_no_private_key_lies_in_it(write: Callable) -> None:

@@ -16,7 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from real_disks import read_only, resize, small_disk
 
+from attentionvote.files import DiskFull, FolderUnavailable
 from attentionvote.geometry.pose import inverse
 from attentionvote.part import Part
 from attentionvote.simulation import cycle, cycle_pool, scene_set
@@ -82,6 +84,32 @@ def test_a_complete_set_is_not_touched(bracket: Part, tmp_path: Path, monkeypatc
     monkeypatch.setattr(scene_set, "run_cycles", lambda *_, **__: pytest.fail("simulated again"))
     assert generate_scene_set(bracket, spec, tmp_path, progress=False).digest == first.digest
     assert SceneSet.is_complete(tmp_path)
+    monkeypatch.setattr(scene_set, "waiting_lock", lambda *_: pytest.fail("a lock was written"))
+    assert generate_scene_set(bracket, spec, tmp_path, progress=False).digest == first.digest
+
+
+def test_a_complete_set_is_used_where_nothing_can_be_written(bracket: Part, tmp_path: Path) -> None:
+    spec = make_spec(bracket, cycles=1, drop_counts=(1,))
+    first = generate_scene_set(bracket, spec, tmp_path / "set", progress=False)
+    (tmp_path / "set" / ".lock").unlink()  # as a copy on a read-only mount may be
+    with read_only(tmp_path):
+        assert generate_scene_set(bracket, spec, tmp_path / "set", progress=False).digest == first.digest
+        with pytest.raises(FolderUnavailable, match=rf"{tmp_path}/new cannot be written: Read-only file system"):
+            generate_scene_set(bracket, spec, tmp_path / "new", progress=False)
+
+
+def test_a_full_disk_is_named_and_the_set_goes_on(bracket: Part, tmp_path: Path) -> None:
+    spec = make_spec(bracket)
+    whole = generate_scene_set(bracket, spec, tmp_path / "whole", progress=False)
+    with small_disk(tmp_path / "disk", "16k") as disk:
+        with pytest.raises(
+            DiskFull, match=rf"^the disk of {disk}/set/cycles must have room, but [\d,]+ bytes are free"
+        ):
+            generate_scene_set(bracket, spec, disk / "set", progress=False)
+        finished = sorted((disk / "set" / "cycles").iterdir())
+        assert [path.name[0] for path in finished] == ["0"] * len(finished)  # nothing half written
+        resize(disk, "1m")
+        assert generate_scene_set(bracket, spec, disk / "set", progress=False).digest == whole.digest
 
 
 def test_splits_and_seeds_are_other_scenes_and_longer_sets_continue(bracket: Part, tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ A verb is a script ``pipelines/<verb>.py`` with a function ``run(settings) -> di
 
 The dictionary is printed as the only line on stdout, one JSON object; everything else that is
 printed while the verb runs, by anybody, goes to stderr. Exit codes: 0 success, 2 impossible
-configuration (before any work), 130 interrupted, 1 anything else (``Refused`` prints its line too).
+configuration (before any work), 130 and 143 interrupted (Ctrl-C, SIGTERM), 1 anything else
+(``Refused`` prints its line too).
 With ``-m`` the words are a grid of jobs (``grid.py``). Heavy imports belong inside ``run``, so that
 ``--help`` and a misspelt word are answered at once.
 """
@@ -31,6 +32,7 @@ from attentionvote.command.configuration import Settings, compose
 from attentionvote.command.errors import ConfigurationError, Refused, sentence
 from attentionvote.command.grid import run_grid
 from attentionvote.command.help import help_text
+from attentionvote.command.interruption import catch_sigterm, interruption
 from attentionvote.execution.job_process import join_starter, report_failure
 from attentionvote.files import FolderUnavailable
 
@@ -62,6 +64,7 @@ def command(
     """
     verb = settings.verb
     join_starter()
+    catch_sigterm()
     _log_to_stderr()
     with _reporting_errors(verb):
         line = command_line(sys.argv[1:])
@@ -169,12 +172,10 @@ def _reporting_errors(verb: str) -> Iterator[None]:
         _leave(f"{verb}: {sentence(error)}", 2)
     except Refused as error:
         _leave(f"{verb}: {sentence(error)}", 1)
-    except KeyboardInterrupt:
-        _leave(f"{verb}: interrupted; run the same command to resume", 130)
-    except SystemExit as error:
-        # Lightning answers Ctrl-C with exit(1) from inside its handler of the KeyboardInterrupt.
-        if isinstance(error.__context__, KeyboardInterrupt):
-            _leave(f"{verb}: interrupted; run the same command to resume", 130)
+    except (KeyboardInterrupt, SystemExit) as error:
+        code = interruption(error)
+        if code is not None:
+            _leave(f"{verb}: interrupted; run the same command to resume", code)
         raise
     except BaseException as error:
         expected = isinstance(error, (ValueError, OSError))

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
 
+from attentionvote.files import disk_full
+
 
 class ConfigurationError(ValueError):
     """What the user asked for is impossible; the message is one sentence. Ends a verb with exit code 2."""
@@ -13,6 +15,7 @@ class ConfigurationError(ValueError):
 
 def sentence(error: BaseException) -> str:
     """The message of ``error`` on one line, or the name of its class when it has none."""
+    error = disk_full(error) or error
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         return f"file not found: {error.filename}"
     return " ".join(str(error).split()) or type(error).__name__

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from attentionvote.data.cloud_pool import jobs_of, run_scenes
 from attentionvote.data.sensing import CloudSettings
 from attentionvote.execution import Executor
-from attentionvote.files import remove_leftovers, waiting_lock, whole
+from attentionvote.files import is_locked, remove_leftovers, waiting_lock, whole
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
 from attentionvote.simulation.scene_set import SceneSet
@@ -107,10 +107,13 @@ def measure_clouds(
 
     Raises:
         ValueError: when the stored clouds are damaged, or the executor cannot work here.
-        OSError: when the worker of one scene died again and again; what is measured is kept and the next call goes on
-            from there.
+        FolderUnavailable: when something is missing and the directory cannot be written.
+        OSError: when the worker of one scene died again and again, or the disk is full; what is measured is kept and
+            the next call goes on from there.
     """
     directory = root / part.name / settings.key(scenes.digest)[:16]
+    if _is_complete(directory):  # nothing is written, not even the lock: it may be a place for reading only
+        return Clouds(directory, scenes)
     with waiting_lock(directory / ".lock"):
         create_arrays(directory, len(scenes), settings.pool)
         done = open_arrays(directory, "r")["done"]
@@ -129,6 +132,13 @@ def measure_clouds(
             for index, scene in measured:
                 measure_into(arrays, index, scene)
     return Clouds(directory, scenes)
+
+
+def _is_complete(directory: Path) -> bool:
+    """Whether all clouds are there and nobody is at them; a row of another machine may come after its mark."""
+    if not (directory / "count.npy").exists() or is_locked(directory):
+        return False
+    return bool(open_arrays(directory, "r")["done"].all())
 
 
 def measure_into(arrays: dict[str, NDArray], index: int, scene: Scene) -> None:

@@ -6,18 +6,18 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from attentionvote.execution.processor_quota import processor_quota
+
 _GPUS = Path("/proc/driver/nvidia/gpus")  # a folder for each that this machine, or this container, has
 
 
 def cores() -> int:
-    """Processor cores this process may use: of its cpuset, and of its container's quota (at least one)."""
-    count = len(os.sched_getaffinity(0))
-    try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        count = min(count, int(quota) // int(period))
-    except (OSError, ValueError):  # no such file, or no quota ("max")
-        pass
-    return max(1, count)
+    """Processor cores this process may use: of its cpuset, and of the quotas of its control groups (at least one).
+
+    A fraction of a core is left out: a thread more than the quota pays for has all of them stopped for the rest of
+    every period, and each operation waits for its last thread.
+    """
+    return max(1, int(min(len(os.sched_getaffinity(0)), processor_quota())))
 
 
 def visible_gpus(environment: Mapping[str, str], present: Path = _GPUS) -> list[str]:

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 from attentionvote.execution.failures import WorkerDied
 from attentionvote.execution.job_process import (
     INTERRUPTED,
+    TERMINATED,
     JobFuture,
     JobProcess,
     Outcome,
@@ -151,8 +152,8 @@ def main() -> int:
         print(json.dumps(outcome.result), flush=True)
         return 0
     report_failure(outcome.sentence)
-    # Ctrl-C there is not ours: the machine was taken away.
-    if outcome.code < 0 or outcome.code == INTERRUPTED:
+    # An interruption there is not ours: the machine was taken away.
+    if outcome.code < 0 or outcome.code in (INTERRUPTED, TERMINATED):
         os.kill(os.getpid(), signal.SIGKILL)
     return outcome.code
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 PARENT, FAILURE = "ATTENTIONVOTE_JOB_PARENT", "ATTENTIONVOTE_JOB_FAILURE"
-INTERRUPTED = 130
+INTERRUPTED, TERMINATED = 130, 143  # exit codes after Ctrl-C and SIGTERM
 # What a job reads of its environment, the passwords of study and tracking included.
 _HANDED_ON = ("ATTENTIONVOTE_", "MLFLOW_TRACKING_", "PG")
 _PR_SET_PDEATHSIG = 1  # of prctl(2)

@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
 from attentionvote.contract import ModelCard
-from attentionvote.files import sync
+from attentionvote.files import naming_full_disk, sync
 from attentionvote.inference import BundleError, Estimate, PoseEstimator
 from attentionvote.inference.bundles.bundle import Bundle, load_bundle
 from attentionvote.inference.bundles.manifest import CARD, GOLDEN, MESH, MODEL, write_manifest
@@ -50,36 +50,37 @@ def write_bundle(
 
     Raises:
         ValueError: when no cloud shows a clear pose, or the bundle does not pass its own self-test.
-        OSError: when it cannot be written; ``latest`` stays where it was.
+        OSError: when it cannot be written (DiskFull without room); ``latest`` stays where it was.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    draft, old = folder / _DRAFT, folder / _OLD
-    for leftover in (draft, old):  # of a killed process
-        shutil.rmtree(leftover, ignore_errors=True)
-    try:
-        (draft / GOLDEN).mkdir(parents=True)
-        (draft / MODEL).write_bytes(model)
-        (draft / CARD).write_text(card.to_json(), encoding="utf-8")
-        for k, member in enumerate(part.parts):
-            write_surface(member.vertices, member.faces, draft / (MESH if k == 0 else f"part_{member.name}.ply"))
-        _write_golden(model, card, clouds, golden, draft)
-        write_manifest(draft, key)
-        bundle = load_bundle(draft, key.public_key())
-        with PoseEstimator(bundle) as estimator:
-            problems = self_test(estimator, bundle)
-        if problems:
-            raise ValueError(f"the bundle must pass its own self-test, but {problems[0]}")
-        bundle_folder = folder / bundle.digest[:12]
-        if not _is_whole(bundle_folder, key):
-            _settle(draft)
-            if bundle_folder.exists():
-                bundle_folder.rename(old)
-            draft.rename(bundle_folder)
-            sync(folder)
-    finally:
-        for leftover in (draft, old):
+    with naming_full_disk(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        draft, old = folder / _DRAFT, folder / _OLD
+        for leftover in (draft, old):  # of a killed process
             shutil.rmtree(leftover, ignore_errors=True)
-    point_latest(bundle_folder)
+        try:
+            (draft / GOLDEN).mkdir(parents=True)
+            (draft / MODEL).write_bytes(model)
+            (draft / CARD).write_text(card.to_json(), encoding="utf-8")
+            for k, member in enumerate(part.parts):
+                write_surface(member.vertices, member.faces, draft / (MESH if k == 0 else f"part_{member.name}.ply"))
+            _write_golden(model, card, clouds, golden, draft)
+            write_manifest(draft, key)
+            bundle = load_bundle(draft, key.public_key())
+            with PoseEstimator(bundle) as estimator:
+                problems = self_test(estimator, bundle)
+            if problems:
+                raise ValueError(f"the bundle must pass its own self-test, but {problems[0]}")
+            bundle_folder = folder / bundle.digest[:12]
+            if not _is_whole(bundle_folder, key):
+                _settle(draft)
+                if bundle_folder.exists():
+                    bundle_folder.rename(old)
+                draft.rename(bundle_folder)
+                sync(folder)
+        finally:
+            for leftover in (draft, old):
+                shutil.rmtree(leftover, ignore_errors=True)
+        point_latest(bundle_folder)
     return load_bundle(bundle_folder, key.public_key())
 
 

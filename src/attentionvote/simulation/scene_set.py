@@ -94,8 +94,9 @@ def generate_scene_set(
 
     Raises:
         ValueError: when the directory holds another set or the part is another one, or the executor cannot work here.
-        OSError: when the worker of one cycle died again and again; what is finished is kept and the next call goes on
-            from there.
+        FolderUnavailable: when something is missing and the directory cannot be written.
+        OSError: when the worker of one cycle died again and again, or the disk is full; what is finished is kept and
+            the next call goes on from there.
     """
     if part.digest != spec.part_digest:
         raise ValueError(
@@ -103,14 +104,11 @@ def generate_scene_set(
         )
     if workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
+    if _is_complete(directory, spec):  # nothing is written, not even the lock: it may be a place for reading only
+        return SceneSet.open(directory)
     with waiting_lock(directory / ".lock"):
-        manifest = _read_manifest(directory)
-        if manifest is not None and manifest["spec_digest"] != spec.digest():
-            raise ValueError(
-                f"{directory} holds scene set {manifest['spec_digest'][:12]}, but {spec.digest()[:12]} was asked for: "
-                "choose another directory"
-            )
-        if manifest is None or manifest["content_digest"] is None:
+        if not _is_complete(directory, spec):  # another process may have been at it
+            manifest = _read_manifest(directory)
             (directory / "cycles").mkdir(exist_ok=True)
             for leftover in [*directory.glob(".*.*.*"), *directory.glob("cycles/.*")]:
                 leftover.unlink()  # temporary files of a killed process; the lock says nobody writes now
@@ -124,6 +122,23 @@ def generate_scene_set(
                 save_records(_shard(directory, cycle), records)
             _write_manifest(directory, part, spec, content_digest(directory, spec.cycles))
     return SceneSet.open(directory)
+
+
+def _is_complete(directory: Path, spec: SceneSetSpec) -> bool:
+    """Whether the set of this specification is there whole; its manifest comes last.
+
+    Raises:
+        ValueError: when the directory holds another set.
+    """
+    manifest = _read_manifest(directory)
+    if manifest is None:
+        return False
+    if manifest["spec_digest"] != spec.digest():
+        raise ValueError(
+            f"{directory} holds scene set {manifest['spec_digest'][:12]}, but {spec.digest()[:12]} was asked for: "
+            "choose another directory"
+        )
+    return manifest["content_digest"] is not None
 
 
 def content_digest(directory: Path, cycles: int) -> str:

@@ -42,9 +42,10 @@ def write_atomically(content: Mapping[str, Any], path: Path) -> None:
     try:
         whole(path, write)
     except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else error
         raise OSError(
-            f"checkpoint {path} cannot be written ({error.strerror or error}); the one before it is kept, "
-            "the same command goes on from there"
+            f"checkpoint {path} cannot be written ({reason}); the one before it is kept, the same command goes on from "
+            "there"
         ) from error
 
 

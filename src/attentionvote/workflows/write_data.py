@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from attentionvote.command.entry import configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.execution.hardware import cores
-from attentionvote.files import read_json, write_json
+from attentionvote.files import naming_full_disk, read_json, write_json
 from attentionvote.workflows.settings import WriteDataSettings
 
 if TYPE_CHECKING:
@@ -69,9 +69,10 @@ def run(cfg: WriteDataSettings) -> dict[str, Any]:
     write = write_ipa if cfg.format == "ipa" else write_bop
     temporary = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        write(temporary, PartCaster(parts), records, lambda done: _say(done, len(records)))
-        write_json(temporary / RECEIPT, receipt)
-        temporary.replace(target)
+        with naming_full_disk(target.parent):
+            write(temporary, PartCaster(parts), records, lambda done: _say(done, len(records)))
+            write_json(temporary / RECEIPT, receipt)
+            temporary.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     log.info("%d scenes in %s; `make check-data DIR=%s` looks at them", len(records), target, target)

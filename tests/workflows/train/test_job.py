@@ -338,14 +338,18 @@ def test_killed_anywhere_and_continued_ends_the_same(
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_ctrl_c_during_training(words: list[str], tmp_path: Path, store: str, verb: Verb) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_during_training(
+    words: list[str], tmp_path: Path, store: str, verb: Verb, number: int, code: int
+) -> None:
     words = [*words, "trainer.max_epochs=400", "data.workers=1"]
     process = verb(words, start_new_session=True)
     checkpoints = tmp_path / "out" / "brick"
     until(process, lambda: any(checkpoints.rglob("last.ckpt")))
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the whole group
+    os.killpg(process.pid, number)  # as a terminal does: the whole group
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (130, "")
+    assert (process.returncode, out) == (code, "")
+    assert err.count("interrupted") == 1
     assert err.splitlines()[-1] == "train: interrupted; run the same command to resume"
     assert "Traceback" not in err
     folder = job_folder(tmp_path)

@@ -227,7 +227,7 @@ def test_two_processes_train_what_one_trains_whatever_interrupts_them(
     assert Path(one["model"]).parent.name == training.name  # the same training, whoever does it
     assert_same_training(one, two, database, IN_DOUBLE)
 
-    # Ctrl-C, then kill -9 of one process, then the rest in one process.
+    # Ctrl-C, then SIGTERM, then kill -9 of one process, then the rest in one process.
     words = [*common, f"outputs={tmp_path / 'cut'}"]
     last = tmp_path / "cut" / "brick" / training.name / "checkpoints" / "last.ckpt"
     process = start(2, words)
@@ -237,6 +237,16 @@ def test_two_processes_train_what_one_trains_whatever_interrupts_them(
     assert (process.returncode, out) == (130, "")
     assert err.count("train: ") == err.count("train: interrupted; run the same command to resume") == 1
     assert "Traceback" not in err
+    before = last.stat().st_mtime_ns
+    process = start(2, words)
+    until(process, lambda: last.stat().st_mtime_ns > before)
+    children = [child_of_rank(process.pid, rank) for rank in (0, 1)]
+    process.send_signal(signal.SIGTERM)  # to the starter alone, as a scheduler does
+    out, err = process.communicate(timeout=40)
+    assert (process.returncode, out) == (143, "")
+    assert err.count("train: ") == err.count("train: interrupted; run the same command to resume") == 1
+    assert "Traceback" not in err
+    assert not [child for child in children if Path(f"/proc/{child}").exists()]
     before = last.stat().st_mtime_ns
     process = start(2, words)
     until(process, lambda: last.stat().st_mtime_ns > before)

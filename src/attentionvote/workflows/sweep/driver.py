@@ -15,7 +15,7 @@ from typing import Any
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from attentionvote.execution.job_executors import JobExecutor
-from attentionvote.execution.job_process import INTERRUPTED, JobFuture, Outcome, cancel_all
+from attentionvote.execution.job_process import INTERRUPTED, TERMINATED, JobFuture, Outcome, cancel_all
 from attentionvote.files import is_locked
 from attentionvote.workflows.sweep.settings import PRUNED_AT, PRUNED_CODE
 from attentionvote.workflows.sweep.study import Ledger
@@ -170,7 +170,7 @@ class SweepDriver:
             else:
                 self._settle()
                 self._end(trial, running.directory, TrialState.COMPLETE, float(value), **about)
-        elif outcome.code < 0 and self.ledger.crashed(trial) <= self.retries:
+        elif (outcome.code < 0 or outcome.code == TERMINATED) and self.ledger.crashed(trial) <= self.retries:
             log.warning("trial %d is taken up again: %s", trial.number, outcome.sentence)
             self.ledger.note(trial, seconds=about["seconds"])
             self.lost.append(self.ledger.trials[trial.number])

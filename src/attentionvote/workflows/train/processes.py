@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from attentionvote.command.errors import ConfigurationError, sentence
+from attentionvote.command.interruption import Terminated
 from attentionvote.execution.hardware import cores
 from attentionvote.execution.job_process import end_with_parent
 
@@ -147,6 +148,11 @@ def first_speaks(process: TrainingProcess) -> Iterator[None]:
         be_silent()
     try:
         yield
+    except Terminated:
+        # torchrun has ended this process after another one, or was told to end and says so itself.
+        if process.processes > 1:
+            be_silent()
+        raise
     except ConfigurationError as error:
         # The processes of one machine find the same; those of another one may find something else.
         if process.local_rank == 0:

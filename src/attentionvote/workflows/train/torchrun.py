@@ -9,6 +9,8 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from attentionvote.execution.job_process import INTERRUPTED
+
 if TYPE_CHECKING:
     from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
 
@@ -27,7 +29,10 @@ def main() -> int:
         _check_processes(sys.argv[1:])
         torchrun()
     except SignalException as ended:
-        return 130 if ended.sigval == signal.SIGINT else 128 + int(ended.sigval)
+        if ended.sigval == signal.SIGINT:  # it reached the processes too, and the first one said so
+            return INTERRUPTED
+        print("train: interrupted; run the same command to resume", file=sys.stderr)
+        return 128 + int(ended.sigval)
     except ChildFailedError as error:
         rank, first = _cause(error.failures)
         if first.exitcode < 0:

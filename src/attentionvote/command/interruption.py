@@ -1,0 +1,32 @@
+"""The two ways in which a verb is interrupted: Ctrl-C, and SIGTERM of whoever manages the machine."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType
+
+from attentionvote.execution.job_process import INTERRUPTED, TERMINATED
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM; what is ready for Ctrl-C is ready for it too, and only the exit code is another."""
+
+
+def catch_sigterm() -> None:
+    """From now on SIGTERM interrupts this process as Ctrl-C does, unless it is ignored or somebody handles it."""
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminate)
+
+
+def interruption(error: BaseException) -> int | None:
+    """The exit code of a verb that this exception ends; None when it was no interruption."""
+    # Lightning answers Ctrl-C with exit(1) from inside its handler of the KeyboardInterrupt.
+    cause = error.__context__ if isinstance(error, SystemExit) else error
+    if isinstance(cause, KeyboardInterrupt):
+        return TERMINATED if isinstance(cause, Terminated) else INTERRUPTED
+    return None
+
+
+def _terminate(number: int, _: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)  # managers repeat it; what is stuck they end by SIGKILL
+    raise Terminated
