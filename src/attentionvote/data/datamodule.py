@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from attentionvote.data.augmentation import Augmentation
 from attentionvote.data.clouds import Clouds
-from attentionvote.data.samples import Batch, collate, draw_sample
+from attentionvote.data.samples import Batch, collate, collate_narrow, draw_sample
 from attentionvote.model.neighborhoods import Layout
 from attentionvote.scene import Scene
 
@@ -96,6 +96,7 @@ class PartDataModule(L.LightningDataModule):
         seed: of everything random.
         rank, processes: which share of every batch, and of the other scenes, this process gets. The shares of all
             make the batches of one process, in its order.
+        on_gpu: whether batches go to a GPU: they are then made in memory that it copies from by itself.
 
     Raises:
         ValueError: when there are too few points or scenes.
@@ -114,6 +115,7 @@ class PartDataModule(L.LightningDataModule):
         seed: int,
         rank: int = 0,
         processes: int = 1,
+        on_gpu: bool = False,
     ) -> None:
         super().__init__()
         if points < layout.centers[0]:
@@ -136,6 +138,7 @@ class PartDataModule(L.LightningDataModule):
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
         self.rank, self.processes = rank, processes
         self.first_epoch = 0
+        self.form: dict[str, Any] = {"collate_fn": collate_narrow if on_gpu else collate, "pin_memory": on_gpu}
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Shuffled, augmented, full batches only; this process's share of each."""
@@ -147,7 +150,7 @@ class PartDataModule(L.LightningDataModule):
             self.train,
             batch_size=self.batch_size // self.processes,
             sampler=sampler,
-            collate_fn=collate,
+            **self.form,
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
             prefetch_factor=4 if self.workers else None,
@@ -179,4 +182,4 @@ class PartDataModule(L.LightningDataModule):
     def _plain(self, samples: CloudSamples) -> DataLoader[Batch]:
         share = scene_share(len(samples), self.rank, self.processes)
         size = self.batch_size // self.processes
-        return DataLoader(samples, batch_size=size, sampler=share, collate_fn=collate, num_workers=0)
+        return DataLoader(samples, batch_size=size, sampler=share, num_workers=0, **self.form)

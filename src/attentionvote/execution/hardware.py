@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from attentionvote.execution.processor_quota import processor_quota
 
 _GPUS = Path("/proc/driver/nvidia/gpus")  # a folder for each that this machine, or this container, has
+_CAPABILITY_MAJOR = 75  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR of cuda.h
 
 
 def cores() -> int:
@@ -41,3 +43,21 @@ def gpu_of_slot(gpus: Sequence[str], slot: int) -> dict[str, str]:
         slot: from 0; no two jobs that run have the same.
     """
     return {"CUDA_VISIBLE_DEVICES": gpus[slot % len(gpus)]} if len(gpus) > 1 else {}
+
+
+def gpu_generation(driver: str = "libcuda.so.1") -> int | None:
+    """Major number of the compute capability of the first NVIDIA GPU that this process may use; None without one.
+
+    Told by the driver: torch would be imported for it, and would set up the device in a process that trains nothing.
+    """
+    try:
+        library = ctypes.CDLL(driver)
+    except OSError:
+        return None
+    device, value = ctypes.c_int(), ctypes.c_int()
+    calls = [
+        lambda: library.cuInit(0),
+        lambda: library.cuDeviceGet(ctypes.byref(device), 0),
+        lambda: library.cuDeviceGetAttribute(ctypes.byref(value), _CAPABILITY_MAJOR, device),
+    ]
+    return None if any(call() for call in calls) else value.value

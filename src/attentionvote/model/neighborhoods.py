@@ -75,12 +75,28 @@ class Neighborhoods(NamedTuple):
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Neighborhoods:
         """The same on another device; the weights in the precision of ``dtype`` where that is given."""
+        at_once = waits_for_nothing(device)
+
+        def index(values: Tensor) -> Tensor:
+            return values.to(device, non_blocking=at_once).long()  # widened there, see ``narrow``
+
         return Neighborhoods(
-            self.order.to(device),
-            tuple(t.to(device) for t in self.neighbors),
-            tuple(t.to(device) for t in self.nearest),
-            tuple(t.to(device, dtype) for t in self.weights),
+            index(self.order),
+            tuple(index(t) for t in self.neighbors),
+            tuple(index(t) for t in self.nearest),
+            tuple(t.to(device, dtype, non_blocking=at_once) for t in self.weights),
         )
+
+    def narrow(self) -> Neighborhoods:
+        """The same with indices of 32 bits, for the way to another device: what uses them wants 64."""
+        return Neighborhoods(
+            self.order.int(), tuple(t.int() for t in self.neighbors), tuple(t.int() for t in self.nearest), self.weights
+        )
+
+
+def waits_for_nothing(device: torch.device | str) -> bool:
+    """Whether a copy to a device may go on while the program does: to a GPU, whose own order keeps it right."""
+    return torch.device(device).type == "cuda"
 
 
 def find_neighborhoods(points: NDArray[np.float32], layout: Layout) -> Neighborhoods:

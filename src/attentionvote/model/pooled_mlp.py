@@ -22,6 +22,7 @@ from attentionvote.geometry import native
 from attentionvote.model.kernels import kernels
 from attentionvote.model.row_threads import LEAST_ROWS, in_threads, thread_count
 
+MOST_NUMBERS = 2**27  # of one layer's activations outside training: 512 MB
 MOST_NEIGHBORS = 256  # the winner of a maximum is kept in a byte
 _FILE = "pooled_mlp.c"
 MOST_LAYERS = 9  # as many as the kernel has pointers for
@@ -67,9 +68,18 @@ def pooled_mlp(
     fits = fits and 2 <= len(weights) // 2 <= MOST_LAYERS
     inputs = [geometry, *weights] if projected is None else [geometry, projected, *weights]
     if not fits or kernels(_FILE, *inputs) is None:
-        return pooled_mlp_reference(geometry, projected, index, weights)
+        return _in_pieces(geometry, projected, index, weights)
     result: Tensor = _PooledMLP.apply(geometry.detach(), projected, index.long(), *weights)
     return result
+
+
+def _in_pieces(geometry: Tensor, projected: Tensor | None, index: Tensor, weights: Sequence[Tensor]) -> Tensor:
+    """``pooled_mlp_reference``, some centres at a time where no gradient needs the activations of all."""
+    rows = max(1, MOST_NUMBERS // (geometry.shape[1] * max(b.shape[0] for b in weights[1::2])))
+    if torch.is_grad_enabled() or torch.compiler.is_compiling() or len(geometry) <= rows:
+        return pooled_mlp_reference(geometry, projected, index, weights)
+    pieces = zip(geometry.split(rows), index.split(rows), strict=True)
+    return torch.cat([pooled_mlp_reference(piece, projected, rows_of, weights) for piece, rows_of in pieces])
 
 
 def pooled_mlp_weights(channels: int, widths: Sequence[int]) -> nn.ParameterList:

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from attentionvote.geometry import native
+from attentionvote.model.constants import Constant
 from attentionvote.model.kernels import kernels
 from attentionvote.model.layers import RowNorm, shared_mlp
 from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_weights
@@ -28,6 +29,7 @@ from attentionvote.model.row_threads import in_threads
 from attentionvote.model.settings import RefinementSettings
 
 CHANNELS = 6
+MOST_NUMBERS = 2**26  # of one table of points by rows: 256 MB, where all proposals of a paper-sized batch need 1 GB
 
 
 class Refined(NamedTuple):
@@ -82,10 +84,14 @@ def points_in_box(
     scale: float,
     count: int,
 ) -> Float[Tensor, "rows count 6"]:
-    """``points_in_box_reference`` by the fastest means at hand; carries no gradient."""
+    """``points_in_box_reference`` by the fastest means at hand, some rows at a time; carries no gradient."""
     library = kernels("network_ops.c", points)
     if library is None:
-        return points_in_box_reference(points, normals, sample, center, rotation, box, scale, count)
+        rows = max(1, MOST_NUMBERS // (CHANNELS * points.shape[1]))
+        if torch.compiler.is_compiling() or len(center) <= rows:
+            return points_in_box_reference(points, normals, sample, center, rotation, box, scale, count)
+        pieces = zip(sample.split(rows), center.split(rows), rotation.split(rows), strict=True)
+        return torch.cat([points_in_box_reference(points, normals, *piece, box, scale, count) for piece in pieces])
     out = torch.empty(len(center), count, CHANNELS)
     p, m, s, c, r, b = (
         t.detach().contiguous().numpy() for t in (points, normals, sample.long(), center, rotation, box)
@@ -117,6 +123,7 @@ class Refiner(nn.Module):
         super().__init__()
         self.diameter, self.points = diameter, settings.points
         self.scale = 2.0 / diameter  # positions looked at are of order one
+        self.identity = Constant(torch.tensor([1.0, 0, 0, 0, 1.0, 0]))
         margin = 0.06 * diameter
         corners = torch.tensor(box, dtype=torch.float32) + torch.tensor([[-margin], [margin]])
         self.box: Tensor
@@ -156,9 +163,8 @@ class Refiner(nn.Module):
         out = widened(self.output(self.mlp(torch.cat([pooled, context], dim=-1))))
         # [r, 10] -> [r, 3], [r, 6] and [r]
         offset, six, score = out[:, :3], out[:, 3:9], out[:, 9]
-        identity = torch.tensor([1.0, 0, 0, 0, 1.0, 0], device=out.device)
         with full_precision(center.device):
             # [r, 3, 3] @ [r, 3, 1] -> [r, 3]
             shift = (rotation @ offset[:, :, None])[..., 0] * (0.1 * self.diameter)
-            turn = matrix_from_six(identity + 0.3 * six)
+            turn = matrix_from_six(self.identity.like(six) + 0.3 * six)
             return Refined(center + shift, rotation @ turn, score)

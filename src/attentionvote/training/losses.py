@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from attentionvote.data.samples import Batch
+from attentionvote.model.constants import Constant
 from attentionvote.model.predictions import Poses, Votes
 from attentionvote.model.proposals import Peaks
 from attentionvote.part import Parts
@@ -22,6 +23,7 @@ from attentionvote.training.processes import summed
 from attentionvote.training.settings import LossSettings
 
 QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
+_QUALITY_STEPS = Constant(torch.tensor(QUALITY_STEPS, dtype=torch.float64))
 
 
 class Assignment(NamedTuple):
@@ -151,7 +153,7 @@ class AttentionVoteLoss:
         distance = distance.masked_fill(~right, torch.inf)
         share = distance / self.true_pose.diameter(part, distance.dtype)
         # [r, 1] < [3] -> [r, 3] -> [r]
-        quality = (share[:, None] < share.new_tensor(QUALITY_STEPS)).to(poses.score.dtype).mean(1)
+        quality = (share[:, None] < _QUALITY_STEPS.like(share)).to(poses.score.dtype).mean(1)
         if not self.settings.one_per_instance:
             return quality
         # [r] -> row of [b * i], one a sample's instance

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from attentionvote.model.constants import Constant
 from attentionvote.model.precision import full_precision
 from attentionvote.part import Parts
 from attentionvote.training.pose_loss import RotationLoss, SymmetricPose, metric_loss
@@ -34,7 +35,7 @@ class PartPoses:
         """D in metres of every row's part, in the precision of ``dtype``; one number where all are the same."""
         if len(self.each) == 1:
             return self.each[0].diameter
-        return self._diameters.to(dtype).to(part.device)[part]
+        return self._diameters.on(part.device, dtype)[part]
 
     def squared_turn(
         self, part: Int[Tensor, " rows"], predicted: Float[Tensor, "rows 3 3"], true: Float[Tensor, "rows 3 3"]
@@ -43,7 +44,7 @@ class PartPoses:
         if len(self.each) == 1:
             return self.each[0].squared_turn(predicted, true)
         # [parts, ...] -> [r, ...]
-        representation, equivalents = (t.to(predicted.dtype).to(true.device)[part] for t in self._tables)
+        representation, equivalents = (table.like(predicted)[part] for table in self._tables)
         with full_precision(true.device):
             # [r, 1, 3, 3] @ [r, g, 3, 3] -> [r, g, 3, 3]
             aims = true[:, None] @ equivalents
@@ -79,19 +80,18 @@ class PartPoses:
             return metric_loss(self.squared_turn(part, rotation, true), self.diameter(part, rotation.dtype))
         if len(self.each) == 1:
             return self.each[0].rotation_loss(kind, quaternion, rotation, true)
-        # Quaternion forms enumerate the equivalents in numpy: part by part is no slower.
+        # Every row by every part, of which one counts: to look for a part's rows would have a GPU wait.
         loss = rotation.new_zeros(len(part))
         for index, pose in enumerate(self.each):
-            rows = torch.nonzero(part == index)[:, 0]
-            loss = loss.index_put((rows,), pose.rotation_loss(kind, quaternion[rows], rotation[rows], true[rows]))
+            loss = torch.where(part == index, pose.rotation_loss(kind, quaternion, rotation, true), loss)
         return loss
 
     @cached_property
-    def _diameters(self) -> Tensor:
-        return torch.tensor([pose.diameter for pose in self.each], dtype=torch.float64)
+    def _diameters(self) -> Constant:
+        return Constant(torch.tensor([pose.diameter for pose in self.each], dtype=torch.float64))
 
     @cached_property
-    def _tables(self) -> tuple[Tensor, Tensor]:
+    def _tables(self) -> tuple[Constant, Constant]:
         """Representations ``(parts, 3, 3)`` and their equivalents ``(parts, most, 3, 3)``, metres."""
         most = max(len(pose.group) for pose in self.each)
         representations, equivalents = [], []
@@ -101,4 +101,4 @@ class PartPoses:
             turned = pose.group @ representation
             representations.append(representation)
             equivalents.append(turned[torch.arange(most) % len(turned)])
-        return torch.stack(representations), torch.stack(equivalents)
+        return Constant(torch.stack(representations)), Constant(torch.stack(equivalents))

@@ -10,6 +10,7 @@ of revolution all quaternion forms become the angle between the axes (Eq. 8).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import get_args
 
 import numpy as np
@@ -17,8 +18,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from attentionvote.geometry.pose import canonical_quaternion, quaternion_from_matrix
+from attentionvote.geometry import pose
+from attentionvote.geometry.pose import canonical_quaternion
+from attentionvote.model.constants import Constant
 from attentionvote.model.precision import full_precision
+from attentionvote.model.rotation import quaternion_from_matrix
 from attentionvote.part import Part
 from attentionvote.training.settings import RotationLoss
 
@@ -60,12 +64,12 @@ class SymmetricPose:
 
     def like(self, values: Tensor) -> SymmetricPose:
         """The same on the device and in the precision of ``values``."""
+        group, representation, *axis = (table.like(values) for table in self._constants)
+        return SymmetricPose(self.diameter, group, representation, axis[0] if axis else None)
 
-        def alike(table: Tensor) -> Tensor:
-            return table.to(values.dtype).to(values.device)  # narrowed first: not every device knows double precision
-
-        axis = None if self.axis is None else alike(self.axis)
-        return SymmetricPose(self.diameter, alike(self.group), alike(self.representation), axis)
+    @cached_property
+    def _constants(self) -> list[Constant]:
+        return [Constant(table) for table in (self.group, self.representation, self.axis) if table is not None]
 
     def squared_turn(
         self, predicted: Float[Tensor, "rows 3 3"], true: Float[Tensor, "rows 3 3"]
@@ -115,10 +119,23 @@ class SymmetricPose:
     def _equivalents(self, true: Tensor) -> Tensor:
         """Canonical quaternions ``(rows, G, 4)`` of the equivalent rotations: here, and only here, the sign that
         Eq. (6) depends on becomes part of the label."""
+        if true.device.type not in ("cpu", "mps"):  # a GPU is not to wait for a copy; mps knows no double precision
+            return equivalent_quaternions(true, self._constants[0].on(true.device, torch.float64))
         # [r, 1, 3, 3] @ [g, 3, 3] -> [r, g, 3, 3]
         matrices = true[:, None].detach().cpu().numpy() @ self.group.cpu().numpy()
-        quaternions = canonical_quaternion(quaternion_from_matrix(matrices))
+        quaternions = canonical_quaternion(pose.quaternion_from_matrix(matrices))
         return torch.from_numpy(quaternions).to(true.dtype).to(true.device)
+
+
+def equivalent_quaternions(true: Float[Tensor, "rows 3 3"], group: Float[Tensor, "g 3 3"]) -> Float[Tensor, "rows g 4"]:
+    """Canonical quaternions of the rotations ``true @ group``, in double precision on the device of ``true``."""
+    with full_precision(true.device):
+        # [r, 1, 3, 3] @ [g, 3, 3] -> [r, g, 3, 3]
+        q = quaternion_from_matrix(true.detach().double()[:, None] @ group)
+    sign = torch.ones_like(q[..., 0])
+    for component in reversed(q.unbind(-1)):  # that of the first one that is not zero, as ``canonical_quaternion``
+        sign = torch.where(component.abs() > 1e-12, component.sign(), sign)
+    return (q * sign[..., None]).to(true.dtype)
 
 
 def metric_loss(

@@ -56,7 +56,7 @@ def _even_choice(rows: Int[Tensor, " rows"], most: int, places: int) -> tuple[In
     Returns:
         this process's share of the choice, and the number of all selected rows.
     """
-    totals = everyones(torch.stack([rows.new_tensor(len(rows)), rows.sum()])).tolist()
+    totals = everyones(torch.stack([rows.new_full((), len(rows)), rows.sum()])).tolist()
     count = sum(size for size, _ in totals)
     stride = -(-count // (most * len(totals)))
     if stride <= 1:

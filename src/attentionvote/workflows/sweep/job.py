@@ -50,7 +50,9 @@ class SweepJob:
         training = compose(TrainSettings, self.base)
         self.training = training
         self.part: str = training.object.name
-        train_folder = find_training(training).directory
+        # Of another machine is known what it was asked for; a GPU decides the precision, and so which training it is.
+        self.gpu = None if cfg.executor == "local" else cfg.cluster.gpus > 0
+        train_folder = find_training(training, self.gpu).directory
         t = training.trainer
         if t.max_epochs < t.validate_every:
             raise ConfigurationError(
@@ -135,7 +137,7 @@ class SweepJob:
 
     def directory(self, values: Mapping[str, Any]) -> Path:
         """The folder of a trial's training."""
-        return find_training(compose(TrainSettings, self._varied(values))).directory
+        return find_training(compose(TrainSettings, self._varied(values)), self.gpu).directory
 
     def _varied(self, values: Mapping[str, Any]) -> list[str]:
         return [*self.base, *(setting.word(values[setting.name]) for setting in self.space)]

@@ -19,6 +19,7 @@ from attentionvote.part import Parts, only_part
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
 from attentionvote.workflows.train.beginning import MODEL, origin
 from attentionvote.workflows.train.network import check_classes
+from attentionvote.workflows.train.precision import CPU_PRECISION, resolved_precision
 from attentionvote.workflows.train.settings import TrainSettings
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class TrainingJob:
         specs: of the scene sets it needs, by split; empty with a dataset.
         dataset: whose scenes it takes instead.
         shorter: folder of the same training with fewer epochs, which it goes on from.
+        precision: of its arithmetic, resolved.
     """
 
     directory: Path
@@ -46,6 +48,7 @@ class TrainingJob:
     specs: dict[str, SceneSetSpec]
     dataset: DatasetSplits | None = None
     shorter: Path | None = None
+    precision: str = CPU_PRECISION
 
     @property
     def scene_counts(self) -> dict[str, int]:
@@ -80,8 +83,12 @@ class TrainingJob:
         return locked_folder(self.directory, str(self.directory.parents[1]), "training")
 
 
-def find_training(cfg: TrainSettings) -> TrainingJob:
+def find_training(cfg: TrainSettings, gpu: bool | None = None) -> TrainingJob:
     """The training of a configuration: new, interrupted or complete; the configuration's parts are checked together.
+
+    Args:
+        cfg: the configuration.
+        gpu: whether the machine that trains has a GPU; None: it is this one.
 
     Raises:
         ValueError: with one sentence, when the parts of the configuration do not fit together.
@@ -93,7 +100,8 @@ def find_training(cfg: TrainSettings) -> TrainingJob:
     for split in ("train", "val", "test"):
         if split not in specs:
             raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
-    job = TrainingJob(Path(cfg.outputs) / part.name, part, specs)
+    precision = resolved_precision(cfg.trainer, gpu)
+    job = TrainingJob(Path(cfg.outputs) / part.name, part, specs, precision=precision)
     if cfg.data.dataset is not None:
         job = replace(job, specs={}, dataset=_dataset(cfg, cfg.data.dataset, part))
     _check(cfg, job.scene_counts["train"])
@@ -123,6 +131,8 @@ def _shorter(cfg: TrainSettings, job: TrainingJob, directory: Path) -> Path | No
 
 def _digest(plain: dict[str, Any], job: TrainingJob) -> str:
     """What identifies a training: its settings, its part, the scenes of a dataset."""
+    if job.precision != CPU_PRECISION:  # auto on a CPU keeps the digest it always had; on a GPU it is another training
+        plain["trainer"]["precision"] = job.precision
     if len(job.part.parts) > 1:  # whether the number was also typed makes no other training
         plain["model"]["classes"] = len(job.part.parts)
     del plain["data"]["held_out"]  # what was trained without a dataset keeps its digest

@@ -104,6 +104,7 @@ def data_module(
     val: Scenes,
     test: Scenes,
     process: TrainingProcess | None = None,
+    on_gpu: bool = False,
 ) -> PartDataModule:
     """Batches of measured scenes: of ours, or any sequence of ``attentionvote.scene.Scene`` with normals.
 
@@ -112,6 +113,7 @@ def data_module(
         module: that it trains.
         train, val, test: the scenes.
         process: this one among those that share it.
+        on_gpu: whether the network is trained on a GPU of NVIDIA's.
 
     Raises:
         ValueError: when there are too few points or scenes.
@@ -129,6 +131,7 @@ def data_module(
         cfg.seed,
         shared.rank,
         shared.processes,
+        on_gpu,
     )
 
 

@@ -25,6 +25,7 @@ from attentionvote.workflows.train.beginning import checkpoint_of, take_over, ta
 from attentionvote.workflows.train.data import prepare_data
 from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
 from attentionvote.workflows.train.pieces import cloud_settings, data_module, pose_training
+from attentionvote.workflows.train.precision import check_precision
 from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
 from attentionvote.workflows.train.results import SplitDetections, assess, best_score, detect_everything, log_losses
 from attentionvote.workflows.train.settings import TrainSettings
@@ -55,9 +56,8 @@ class TrainingRun:
         self.workers = cfg.workers or cores()
         self.progress, self.pictures, self.checkpoint_files = TrainingProgress(), ScenePictures(), AtomicCheckpoints()
         with quiet_lightning():
-            self.trainer = lightning_trainer(
-                cfg, job.directory, process, [self.progress, self.pictures], self.checkpoint_files
-            )
+            self.trainer = lightning_trainer(cfg, job, process, [self.progress, self.pictures], self.checkpoint_files)
+        check_precision(cfg.trainer.precision, job.precision, self.trainer.strategy.root_device.type)
         # Lightning itself does so only after the average of the weights was set up and a checkpoint was loaded.
         self.trainer.precision_plugin.convert_module(self.module)
 
@@ -76,7 +76,10 @@ class TrainingRun:
             self.module.metadata["dataset"] = self.job.dataset.described()
         data_seconds = time.monotonic() - start
         with plain_loader_errors(), quiet_lightning():
-            data = data_module(self.cfg, self.module, clouds["train"], clouds["val"], clouds["test"], self.process)
+            on_gpu = self.trainer.strategy.root_device.type == "cuda"
+            data = data_module(
+                self.cfg, self.module, clouds["train"], clouds["val"], clouds["test"], self.process, on_gpu=on_gpu
+            )
             if self.process.rank:
                 self._fit(data, None)
                 if not self.cfg.trainer.dev_batches:

@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
-from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from attentionvote.section import Target
+from attentionvote.training.averaging import MovingAverage
 from attentionvote.training.checkpoint_writer import AtomicCheckpoints
 from attentionvote.training.schedule import JUDGED_BY
-from attentionvote.training.settings import TrainerSettings
 from attentionvote.training.synced_norm import RowNormSync
 from attentionvote.training.termination import PlainTermination
 from attentionvote.workflows.sweep.trial_report import trial_callbacks
+from attentionvote.workflows.train.job import TrainingJob
 from attentionvote.workflows.train.processes import TrainingProcess
 from attentionvote.workflows.train.settings import TrainSettings
 
@@ -30,7 +30,7 @@ _PROFILERS: dict[str, type[Profiler]] = {
 
 def lightning_trainer(
     cfg: TrainSettings,
-    folder: Path,
+    job: TrainingJob,
     process: TrainingProcess,
     watching: list[Callback],
     checkpoint_files: AtomicCheckpoints,
@@ -39,7 +39,7 @@ def lightning_trainer(
 
     Args:
         cfg: its settings.
-        folder: of its files.
+        job: its folder and precision.
         process: this one among those that share it.
         watching: callbacks of the run's.
         checkpoint_files: how checkpoints are written.
@@ -47,20 +47,21 @@ def lightning_trainer(
     Raises:
         ValueError: with one sentence, when the settings are impossible on this machine.
     """
-    t, checkpoints = cfg.trainer, folder / "checkpoints"
+    t, folder = cfg.trainer, job.directory
+    checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(checkpoints, "best", monitor=JUDGED_BY, mode="max", enable_version_counter=False)
     last = ModelCheckpoint(checkpoints, "last", enable_version_counter=False, save_on_train_epoch_end=True)
     callbacks: list[Callback] = [best, last, *watching, *trial_callbacks()]
     callbacks += [made(f"callbacks.{name}", callback) for name, callback in cfg.callbacks.items()]
     if t.average_decay:
-        callbacks.append(EMAWeightAveraging(decay=t.average_decay, use_buffers=True))
+        callbacks.append(MovingAverage(t.average_decay))
     if process.processes > 1:
         callbacks.append(PlainTermination())
     try:
         return L.Trainer(
             accelerator=t.accelerator,
             **process.trainer_arguments(),
-            precision=_precision(t),
+            precision=job.precision,
             max_epochs=t.max_epochs,
             max_steps=-1 if t.max_steps is None else t.max_steps,
             accumulate_grad_batches=t.accumulate_grad_batches,
@@ -99,9 +100,3 @@ def made(key: str, target: Target) -> Any:
 def _profiler(name: str | None, folder: Path) -> Profiler | None:
     """A profiler of Lightning that writes its report into a folder."""
     return None if name is None else _PROFILERS[name](dirpath=folder, filename="profile")
-
-
-def _precision(t: TrainerSettings) -> Any:
-    if t.precision != "auto":
-        return t.precision
-    return "bf16-mixed" if torch.cuda.is_available() and torch.cuda.is_bf16_supported() else "32-true"

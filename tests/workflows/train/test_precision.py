@@ -1,0 +1,119 @@
+"""The precision that ``auto`` means, and that it tells trainings apart only where it is not a CPU's."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_training import TINY_TRAINING
+
+from attentionvote.command.configuration import compose
+from attentionvote.execution import hardware
+from attentionvote.workflows.train import precision as precision_module
+from attentionvote.workflows.train.job import find_training
+from attentionvote.workflows.train.precision import check_precision, resolved_precision
+from attentionvote.workflows.train.settings import TrainSettings
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None, str], None]:
+    """Makes this machine one with a GPU of a generation, and a build of torch."""
+
+    def become(generation: int | None, build: str = "+cu128") -> None:
+        monkeypatch.setattr(precision_module, "gpu_generation", lambda: generation)
+        monkeypatch.setattr(precision_module, "version", lambda _: f"2.13.0{build}")
+
+    return become
+
+
+def settings(*words: str) -> TrainSettings:
+    return compose(TrainSettings, ["object=brick", *TINY_TRAINING, *words])
+
+
+@pytest.mark.parametrize(
+    ("generation", "build", "accelerator", "expected"),
+    [
+        (9, "+cu128", "auto", "bf16-mixed"),
+        (8, "", "gpu", "bf16-mixed"),
+        (8, "+cu128", "cuda", "bf16-mixed"),
+        (9, "+cu128", "cpu", "32-true"),
+        (9, "+cu128", "mps", "32-true"),
+        (7, "+cu128", "auto", "32-true"),
+        (9, "+cpu", "auto", "32-true"),
+        (None, "+cu128", "auto", "32-true"),
+    ],
+)
+def test_auto_follows_the_accelerator_that_is_used(
+    machine: Any, generation: int | None, build: str, accelerator: str, expected: str
+) -> None:
+    machine(generation, build)
+    trainer = settings("trainer.precision=auto", f"trainer.accelerator={accelerator}").trainer
+    assert resolved_precision(trainer) == expected
+    assert resolved_precision(replace(trainer, precision="64-true")) == "64-true"
+
+
+def test_the_machine_that_trains_may_be_another(machine: Any) -> None:
+    trainer = settings("trainer.precision=auto").trainer
+    machine(None)
+    assert resolved_precision(trainer, gpu=True) == "bf16-mixed"
+    machine(9)
+    assert resolved_precision(trainer, gpu=False) == "32-true"
+
+
+def test_a_training_of_a_gpu_is_another_training_than_that_of_a_cpu(machine: Any, tmp_path: Path) -> None:
+    auto = settings("trainer.precision=auto", f"outputs={tmp_path}")
+    machine(None)
+    on_cpu = find_training(auto)
+    assert (on_cpu.precision, on_cpu.directory.name) == ("32-true", "DIGEST_OF_TODAY")
+    machine(9)
+    on_gpu = find_training(auto)
+    assert on_gpu.precision == "bf16-mixed"
+    assert on_gpu.directory != on_cpu.directory
+    named = find_training(settings("trainer.precision=bf16-mixed", f"outputs={tmp_path}"))
+    assert named.directory == on_gpu.directory  # what is trained counts, not how it was asked for
+    assert find_training(settings("trainer.precision=auto", "trainer.accelerator=cpu")).precision == "32-true"
+
+
+def test_half_precision_on_a_cpu_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"^trainer.precision=16-mixed must be trained on a GPU, got the CPU, .*32-true$"
+    ):
+        check_precision("16-mixed", "16-mixed", "cpu")
+    with pytest.raises(ValueError, match=r"^trainer.precision=auto means bf16-mixed .* set trainer.accelerator=cpu$"):
+        check_precision("auto", "bf16-mixed", "cpu")
+    for setting, precision, device in [
+        ("16-mixed", "16-mixed", "cuda"), ("auto", "bf16-mixed", "cuda"), ("bf16-mixed", "bf16-mixed", "cpu"),
+        ("auto", "32-true", "cpu"),
+    ]:  # fmt: skip
+        check_precision(setting, precision, device)
+
+
+class Driver:
+    """libcuda of a machine with one GPU, or with none that this process may use."""
+
+    def __init__(self, major: int, error: int = 0) -> None:
+        self.major, self.error = major, error
+
+    def cuInit(self, _: int) -> int:
+        return 0
+
+    def cuDeviceGet(self, _: Any, index: int) -> int:
+        assert index == 0
+        return self.error
+
+    def cuDeviceGetAttribute(self, value: Any, attribute: int, _: Any) -> int:
+        assert attribute == 75
+        value._obj.value = self.major
+        return 0
+
+
+def test_the_generation_of_the_gpu_without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hardware.gpu_generation("libno-such-driver.so") is None
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: Driver(9))
+    assert hardware.gpu_generation() == 9
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: Driver(9, error=101))  # CUDA_VISIBLE_DEVICES hides it
+    assert hardware.gpu_generation() is None
