@@ -138,3 +138,31 @@ def test_every_scene_is_looked_at_by_one_process(size: int, processes: int) -> N
     assert [scene for share in shares for scene in share] == list(range(size))
     assert all(shares)  # Lightning does not validate where there is nothing: the others would wait for ever
     assert len(shares[0]) == max(map(len, shares))
+
+
+@pytest.mark.filterwarnings("ignore:.*pin_memory.*no accelerator")  # of torch, where there is no GPU to pin for
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_for_a_gpu_are_narrow_on_the_way_and_the_same_there(
+    clouds: Clouds, layout: Layout, workers: int
+) -> None:
+    plain = module(clouds, layout, workers)
+    for_gpu = PartDataModule(clouds, clouds, clouds, 64, layout, 2, workers, Augmentation(), 3, on_gpu=True)
+    assert for_gpu.train_dataloader().pin_memory
+    assert for_gpu.val_dataloader().pin_memory
+    assert not plain.train_dataloader().pin_memory
+    for expected, narrow in zip(plain.train_dataloader(), for_gpu.train_dataloader(), strict=True):
+        indices = narrow.neighborhoods.order, *narrow.neighborhoods.neighbors, *narrow.neighborhoods.nearest
+        assert {t.dtype for t in indices} == {torch.int32}
+        assert_same(expected, narrow.to("cpu"))
+
+
+def assert_same(expected: Batch, actual: Batch) -> None:
+    for name in Batch._fields:
+        pair = [getattr(batch, name) for batch in (expected, actual)]
+        if name == "neighborhoods":
+            assert [type(part) for part in pair[0]] == [type(part) for part in pair[1]]
+            pair = [
+                torch.cat([t.flatten().double() for t in (n.order, *n.neighbors, *n.nearest, *n.weights)]) for n in pair
+            ]
+            assert actual.neighborhoods.order.dtype == torch.int64
+        assert torch.equal(*pair), name

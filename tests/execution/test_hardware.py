@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -47,3 +49,30 @@ def test_jobs_side_by_side_have_gpus_of_their_own_as_long_as_there_are_some() ->
     chosen = [gpu_of_slot(["2", "5", "7"], slot) for slot in range(5)]
     assert [c["CUDA_VISIBLE_DEVICES"] for c in chosen] == ["2", "5", "7", "2", "5"]
     assert gpu_of_slot(["2"], 1) == gpu_of_slot([], 1) == {}
+
+
+class Driver:
+    """libcuda of a machine with one GPU, or with none that this process may use."""
+
+    def __init__(self, major: int, error: int = 0) -> None:
+        self.major, self.error = major, error
+
+    def cuInit(self, _: int) -> int:
+        return 0
+
+    def cuDeviceGet(self, _: Any, index: int) -> int:
+        assert index == 0
+        return self.error
+
+    def cuDeviceGetAttribute(self, value: Any, attribute: int, _: Any) -> int:
+        assert attribute == 75
+        value._obj.value = self.major
+        return 0
+
+
+def test_the_generation_of_the_gpu_without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hardware.gpu_generation("libno-such-driver.so") is None
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: Driver(9))
+    assert hardware.gpu_generation() == 9
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: Driver(9, error=101))  # CUDA_VISIBLE_DEVICES hides it
+    assert hardware.gpu_generation() is None

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from attentionvote.model import pooled_mlp as pooled_mlp_module
 from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_reference
 
 pytestmark = pytest.mark.usefixtures("kernels")
@@ -208,3 +210,23 @@ def test_the_libraries_are_those_of_this_package(kernels: dict[str, ctypes.CDLL]
         ),
     }.items():
         assert all(hasattr(kernels[file], name) for name in names)
+
+
+@pytest.mark.parametrize("most", [1, 16 * 8 * 2])
+def test_without_a_gradient_it_goes_piece_by_piece(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    geometry, projected, index, weights = arguments(5, 8, 10, (16, 16))
+    inputs = geometry.double(), projected.double(), index, [w.double() for w in weights]
+    whole, pieces = pooled_mlp_reference(*inputs), []
+
+    def counted(piece: Tensor, *rest: Any) -> Tensor:
+        pieces.append(len(piece))
+        return pooled_mlp_reference(piece, *rest)
+
+    monkeypatch.setattr(pooled_mlp_module, "MOST_NUMBERS", most)
+    monkeypatch.setattr(pooled_mlp_module, "pooled_mlp_reference", counted)
+    with torch.no_grad():
+        torch.testing.assert_close(pooled_mlp(*inputs), whole, rtol=1e-14, atol=1e-14)
+    assert pieces == {1: [1] * 5, 256: [2, 2, 1]}[most]
+    pieces.clear()
+    assert torch.equal(pooled_mlp(*inputs), whole)
+    assert pieces == [5]  # a backward pass needs all of it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from attentionvote.model import refinement
 from attentionvote.model.refinement import Refiner, points_in_box, points_in_box_reference
 from attentionvote.model.settings import RefinementSettings
 
@@ -110,3 +112,22 @@ def test_the_given_pose_gets_no_gradient_and_every_weight_a_finite_one(make_clou
     assert center.grad is None
     assert rotation.grad is None
     assert all(p.grad is not None and p.grad.isfinite().all() for p in refiner.parameters())
+
+
+@pytest.mark.parametrize("most", [1, 6 * 60 * 2, 6 * 60 * 5])
+def test_some_rows_at_a_time_are_the_same_bits(
+    make_cloud: Callable, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    points, normals = (t.double() for t in make_cloud(1, 2, 60))  # for which there is no C function
+    center, rotation = (t.double() for t in poses(1, 5))
+    arguments = points, normals, torch.tensor([0, 1, 0, 1, 1]), center, rotation, BOX.double(), 20.0, 9
+    monkeypatch.setattr(refinement, "MOST_NUMBERS", most)
+    pieces = []
+
+    def counted(*piece: Any) -> Tensor:
+        pieces.append(len(piece[2]))
+        return points_in_box_reference(*piece)
+
+    monkeypatch.setattr(refinement, "points_in_box_reference", counted)
+    assert torch.equal(points_in_box(*arguments), points_in_box_reference(*arguments))
+    assert pieces == {1: [1] * 5, 720: [2, 2, 1], 1800: [5]}[most]

@@ -23,7 +23,7 @@ from attentionvote.geometry.pose import (
 )
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part
-from attentionvote.training.pose_loss import SymmetricPose, angle_between, quaternion_loss
+from attentionvote.training.pose_loss import SymmetricPose, angle_between, equivalent_quaternions, quaternion_loss
 
 KINDS = ("metric", "slerp", "minra", "nlerp")
 
@@ -206,3 +206,23 @@ def test_losses_are_computed_where_the_poses_are(symmetric_part: Part) -> None:
     assert pose.distance(center, rotation, center, rotation).device.type == "meta"
     kind = "slerp" if symmetric_part.symmetry.is_revolution else "metric"
     assert pose.rotation_loss(kind, center.new_zeros(4, 4), rotation, rotation).device.type == "meta"
+
+
+def test_labels_of_a_gpu_are_those_of_a_cpu(symmetric_part: Part, make_rotations: Callable) -> None:
+    pose = SymmetricPose.of(symmetric_part)
+    halves = np.stack([rotation_about(axis, np.pi) for axis in np.vstack([np.eye(3), [[0, 1, -1]], [[1, -1, 1]]])])
+    true = torch.from_numpy(np.concatenate([make_rotations(5, 200), halves, np.eye(3)[None]]))
+    for rotations in (true, true.float()):
+        labels = equivalent_quaternions(rotations, pose.group)
+        assert labels.dtype == rotations.dtype
+        on_cpu = pose._equivalents(rotations)
+        same = (labels - on_cpu).abs().amax(-1) < 1e-7 if rotations is true else (labels - on_cpu).abs().amax(-1) < 1e-6
+        # q and -q of a half turn, whose first component is rounding: either is a label, and few are.
+        assert same[:200].all()
+        assert ((labels + on_cpu).abs().amax(-1) < 1e-6)[~same].all()
+        assert (~same).sum() <= 3
+
+
+def test_quaternion_losses_run_on_a_gpu(make_box: Callable) -> None:
+    pose, rotation = SymmetricPose.of(make_box()), torch.zeros(4, 3, 3, device="meta")
+    assert pose.rotation_loss("slerp", torch.zeros(4, 4, device="meta"), rotation, rotation).device.type == "meta"

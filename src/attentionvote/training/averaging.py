@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import lightning as L
+import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -29,9 +30,14 @@ class MovingAverage(EMAWeightAveraging):
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Make the average, on the device of the weights."""
-        on_gpu = pl_module.device.type != "cpu"
-        if on_gpu:
+        grouped = averages_in_groups(pl_module.device)
+        if grouped:
             self._kwargs = {"multi_avg_fn": get_ema_multi_avg_fn(self.decay)}
         super().setup(trainer, pl_module, stage)
-        if on_gpu and self._average_model is not None:
+        if grouped and self._average_model is not None:
             self._average_model.n_averaged = self._average_model.n_averaged.cpu()
+
+
+def averages_in_groups(device: torch.device) -> bool:
+    """Whether all weights are averaged together: anywhere but on a CPU."""
+    return device.type != "cpu"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from tiny_training import TINY_TRAINING
 
 from attentionvote.command.configuration import compose
-from attentionvote.execution import hardware
+from attentionvote.command.identity import without
 from attentionvote.workflows.train import precision as precision_module
 from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.precision import check_precision, resolved_precision
@@ -57,7 +58,7 @@ def test_auto_follows_the_accelerator_that_is_used(
 
 
 def test_the_machine_that_trains_may_be_another(machine: Any) -> None:
-    trainer = settings("trainer.precision=auto").trainer
+    trainer = settings("trainer.precision=auto", "trainer.accelerator=auto").trainer
     machine(None)
     assert resolved_precision(trainer, gpu=True) == "bf16-mixed"
     machine(9)
@@ -65,15 +66,22 @@ def test_the_machine_that_trains_may_be_another(machine: Any) -> None:
 
 
 def test_a_training_of_a_gpu_is_another_training_than_that_of_a_cpu(machine: Any, tmp_path: Path) -> None:
-    auto = settings("trainer.precision=auto", f"outputs={tmp_path}")
+    words = "trainer.accelerator=auto", f"outputs={tmp_path}"
+    auto = settings("trainer.precision=auto", *words)
     machine(None)
     on_cpu = find_training(auto)
-    assert (on_cpu.precision, on_cpu.directory.name) == ("32-true", "DIGEST_OF_TODAY")
+    assert on_cpu.precision == "32-true"
+    # What every earlier training on a CPU was named by: the settings as they were composed.
+    plain = without(auto.composed)
+    del plain["data"]["held_out"], plain["data"]["dataset"]
+    assert plain["trainer"]["precision"] == "auto"
+    text = json.dumps([plain, on_cpu.part.digest], sort_keys=True)
+    assert on_cpu.directory.name == hashlib.sha256(text.encode()).hexdigest()[:12]
     machine(9)
     on_gpu = find_training(auto)
     assert on_gpu.precision == "bf16-mixed"
     assert on_gpu.directory != on_cpu.directory
-    named = find_training(settings("trainer.precision=bf16-mixed", f"outputs={tmp_path}"))
+    named = find_training(settings("trainer.precision=bf16-mixed", *words))
     assert named.directory == on_gpu.directory  # what is trained counts, not how it was asked for
     assert find_training(settings("trainer.precision=auto", "trainer.accelerator=cpu")).precision == "32-true"
 
@@ -90,30 +98,3 @@ def test_half_precision_on_a_cpu_is_refused() -> None:
         ("auto", "32-true", "cpu"),
     ]:  # fmt: skip
         check_precision(setting, precision, device)
-
-
-class Driver:
-    """libcuda of a machine with one GPU, or with none that this process may use."""
-
-    def __init__(self, major: int, error: int = 0) -> None:
-        self.major, self.error = major, error
-
-    def cuInit(self, _: int) -> int:
-        return 0
-
-    def cuDeviceGet(self, _: Any, index: int) -> int:
-        assert index == 0
-        return self.error
-
-    def cuDeviceGetAttribute(self, value: Any, attribute: int, _: Any) -> int:
-        assert attribute == 75
-        value._obj.value = self.major
-        return 0
-
-
-def test_the_generation_of_the_gpu_without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert hardware.gpu_generation("libno-such-driver.so") is None
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: Driver(9))
-    assert hardware.gpu_generation() == 9
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: Driver(9, error=101))  # CUDA_VISIBLE_DEVICES hides it
-    assert hardware.gpu_generation() is None
