@@ -34,11 +34,11 @@ def disk_full(error: BaseException, folder: Path | None = None) -> DiskFull | No
     """The error of a full disk, or of a used-up quota, that this exception tells of; None when it tells of another.
 
     Args:
-        error: by the system, or by SQLite, however it is wrapped.
+        error: by the system; where the folder is named also by SQLite, however it is wrapped.
         folder: that was written to; None: the one that ``error`` names, else the fullest of those that may be meant.
     """
     number = error.errno if isinstance(error, OSError) else None
-    by_database = "database or disk is full" in str(error)
+    by_database = folder is not None and "database or disk is full" in str(error)
     if number not in (errno.ENOSPC, errno.EDQUOT) and not by_database:
         return None
     if isinstance(error, DiskFull):

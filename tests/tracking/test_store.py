@@ -8,7 +8,9 @@ from collections import Counter
 
 import pytest
 import warm_starter
+from real_disks import resize, small_disk
 
+from attentionvote.files import DiskFull
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
 from attentionvote.tracking.store import (
@@ -159,6 +161,7 @@ def test_exclusive_lets_one_in_at_a_time_and_the_next_after_a_kill(kind, request
 RACE = """
 import os, sys, tempfile, warnings
 warnings.simplefilter("ignore")
+from attentionvote.files import DiskFull
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import quiet_environment
 quiet_environment()
@@ -198,3 +201,23 @@ def test_processes_may_open_a_fresh_database_at_once(empty_database):
     runs = client.search_runs([experiment.experiment_id])
     assert Counter(run.info.status for run in runs) == {"FINISHED": 4}
     assert sorted(run.data.metrics["x"] for run in runs) == [0, 1, 2, 3]
+
+
+def test_a_full_disk_leaves_no_half_database(tmp_path):
+    with small_disk(tmp_path / "disk", "400k") as disk:
+        uri = f"sqlite:///{disk}/mlflow.db"
+        with pytest.raises(DiskFull, match=rf"^the disk of {disk} must have room, but [\d,]+ bytes are free"):
+            connect(uri)
+        assert [path.name for path in disk.iterdir()] == ["mlflow.db.lock"]
+        (disk / ".mlflow.1.db").touch()  # of a killed process
+        (disk / ".mlflow.1.db-journal").touch()
+        resize(disk, "8m")
+        client = connect(uri)
+        assert sorted(path.name for path in disk.iterdir()) == ["mlflow.db", "mlflow.db.lock"]
+        with (disk / "rest").open("wb", buffering=0) as rest, pytest.raises(OSError, match="No space left"):
+            while True:
+                rest.write(b"x" * 4096)
+        with pytest.raises(DiskFull, match=rf"^the disk of {disk} must have room"):
+            experiment_id(client, uri, "rod")
+        (disk / "rest").unlink()
+        assert experiment_id(client, uri, "rod")

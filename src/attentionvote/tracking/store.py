@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from attentionvote.files import waiting_lock
+from attentionvote.files import DiskFull, disk_full, remove_leftovers, waiting_lock, whole
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -183,6 +183,7 @@ def connect(uri: str) -> MlflowClient:
 
     Raises:
         ConnectionError: a server does not answer, or wants other credentials than it was given.
+        DiskFull: a database on this machine has no room.
         ValueError: the store cannot be used (for example tables of another MLflow version).
     """
     if is_server(uri):
@@ -196,19 +197,54 @@ def connect(uri: str) -> MlflowClient:
     for name in ("urllib3.connectionpool", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
     try:
-        with exclusive(uri), warnings.catch_warnings():
+        with exclusive(uri), warnings.catch_warnings(), _naming_full_disk(uri):
             warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
+            _create_database(uri)
             client = MlflowClient(uri, registry_uri=uri)
     except MlflowException as error:
         sentence = str(error).strip().splitlines()[0]
         hint = f"; try `mlflow db upgrade {shown(uri)}`" if "schema" in sentence else ""
         raise ValueError(f"tracking store {shown(uri)} cannot be used: {sentence}{hint}") from error
+    except DiskFull:
+        raise
     except Exception as error:  # SQLAlchemy's, for what is no database, is away or lets us not in
         sentence = str(error).strip().splitlines()[0]
         raise ValueError(f"tracking store {shown(uri)} cannot be opened: {sentence}") from error
     if is_server(uri):
         _check_access(client, uri)
     return client
+
+
+@contextlib.contextmanager
+def _naming_full_disk(uri: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # of SQLAlchemy or MLflow, around SQLite's
+        full = disk_full(error, Path(uri.removeprefix("sqlite:///")).parent) if uri.startswith("sqlite:///") else None
+        if full is None:
+            raise
+        raise full from error
+
+
+def _create_database(uri: str) -> None:
+    """Make a new SQLite file whole or not at all: half of MLflow's tables, of a full disk or a kill, open no more."""
+    path = Path(uri.removeprefix("sqlite:///"))
+    if uri.startswith("sqlite:///") and not path.exists():
+        for name in (path.name, f"{path.name}-journal"):
+            remove_leftovers(path.with_name(name))
+        whole(path, _make_tables)
+
+
+def _make_tables(path: Path) -> None:
+    from mlflow.store.db.utils import _initialize_tables
+    from sqlalchemy import URL, create_engine
+    from sqlalchemy.pool import NullPool
+
+    engine = create_engine(URL.create("sqlite", database=str(path)), poolclass=NullPool)
+    try:
+        _initialize_tables(engine)
+    finally:
+        engine.dispose()
 
 
 def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
@@ -220,7 +256,7 @@ def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
     from mlflow.exceptions import MlflowException
 
     try:
-        with exclusive(uri):
+        with exclusive(uri), _naming_full_disk(uri):
             return _ensured_experiment(client, uri, name)
     except MlflowException as error:
         if error.get_http_status_code() != 403:
