@@ -98,6 +98,14 @@ def test_status_of(error, status):
     assert status_of(error) == status
 
 
+def test_what_an_interrupt_brings_about_is_the_interrupt():
+    error = RuntimeError("DataLoader worker is killed by signal: Terminated.")
+    error.__context__ = SystemExit(1)
+    assert status_of(error) == "FAILED"
+    error.__context__.__context__ = KeyboardInterrupt()
+    assert status_of(error) == "KILLED"
+
+
 def test_leaving_the_block_by_an_exception_ends_the_run_as_failed(store, client):
     with pytest.raises(RuntimeError), start_run(store, "rod", system_interval_s=0) as run:  # noqa: PT012
         run.log_metrics({"x": 1.0}, 0)

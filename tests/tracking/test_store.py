@@ -1,5 +1,6 @@
 """The store: which URI, no password in what is said, and several processes on a fresh database at once."""
 
+import contextlib
 import subprocess
 import sys
 import threading
@@ -214,9 +215,9 @@ def test_a_full_disk_leaves_no_half_database(tmp_path):
         resize(disk, "8m")
         client = connect(uri)
         assert sorted(path.name for path in disk.iterdir()) == ["mlflow.db", "mlflow.db.lock"]
-        with (disk / "rest").open("wb", buffering=0) as rest, pytest.raises(OSError, match="No space left"):
-            while True:
-                rest.write(b"x" * 4096)
+        with (disk / "rest").open("wb", buffering=0) as rest, contextlib.suppress(OSError):
+            while rest.write(b"x" * 4096):
+                pass
         with pytest.raises(DiskFull, match=rf"^the disk of {disk} must have room"):
             experiment_id(client, uri, "rod")
         (disk / "rest").unlink()

@@ -172,12 +172,12 @@ def _reporting_errors(verb: str) -> Iterator[None]:
         _leave(f"{verb}: {sentence(error)}", 2)
     except Refused as error:
         _leave(f"{verb}: {sentence(error)}", 1)
-    except (KeyboardInterrupt, SystemExit) as error:
+    except BaseException as error:
         code = interruption(error)
         if code is not None:
             _leave(f"{verb}: interrupted; run the same command to resume", code)
-        raise
-    except BaseException as error:
+        if isinstance(error, SystemExit):
+            raise
         expected = isinstance(error, (ValueError, OSError))
         kind = "" if expected else f"{type(error).__name__}: "
         _leave(f"{verb}: {kind}{sentence(error)}{_details(verb)}", 1)

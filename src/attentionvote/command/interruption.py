@@ -19,12 +19,17 @@ def catch_sigterm() -> None:
 
 
 def interruption(error: BaseException) -> int | None:
-    """The exit code of a verb that this exception ends; None when it was no interruption."""
-    # Lightning answers Ctrl-C with exit(1) from inside its handler of the KeyboardInterrupt.
-    cause = error.__context__ if isinstance(error, SystemExit) else error
-    if isinstance(cause, KeyboardInterrupt):
-        return TERMINATED if isinstance(cause, Terminated) else INTERRUPTED
-    return None
+    """The exit code of a verb that this exception ends; None when it was no interruption.
+
+    What is raised while an interruption is on its way is part of it: Lightning answers Ctrl-C with ``exit(1)``, and a
+    signal for the whole group also ends loader processes, which torch reports as an error.
+    """
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__context__
+    if cause is None:
+        return None
+    return TERMINATED if isinstance(cause, Terminated) else INTERRUPTED
 
 
 def _terminate(number: int, _: FrameType | None) -> None:

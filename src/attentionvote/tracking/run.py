@@ -32,7 +32,14 @@ PARAM_LIMIT = 6000  # MLflow's limit for a value
 
 
 def status_of(error: BaseException | None) -> Status:
-    """How a run ended by an exception ends: interrupts and exits on purpose are KILLED, everything else FAILED."""
+    """How a run ended by an exception ends: interrupts and exits on purpose are KILLED, everything else FAILED.
+
+    What an interrupt brings about while it is on its way, such as the end of a loader process, does not count.
+    """
+    cause = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__context__
+    error = cause or error
     if error is None or (isinstance(error, SystemExit) and error.code in (None, 0)):
         return "FINISHED"
     return "KILLED" if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit) else "FAILED"

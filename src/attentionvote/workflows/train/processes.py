@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from attentionvote.command.errors import ConfigurationError, sentence
-from attentionvote.command.interruption import Terminated
+from attentionvote.command.interruption import interruption
 from attentionvote.execution.hardware import cores
-from attentionvote.execution.job_process import end_with_parent
+from attentionvote.execution.job_process import TERMINATED, end_with_parent
 
 FirstDoes = Callable[[str, Callable[[], Any]], Any]  # see ``attentionvote.training.processes``
 _VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
@@ -148,9 +148,9 @@ def first_speaks(process: TrainingProcess) -> Iterator[None]:
         be_silent()
     try:
         yield
-    except Terminated:
+    except (KeyboardInterrupt, SystemExit) as error:
         # torchrun has ended this process after another one, or was told to end and says so itself.
-        if process.processes > 1:
+        if process.processes > 1 and interruption(error) == TERMINATED:
             be_silent()
         raise
     except ConfigurationError as error:
@@ -159,7 +159,7 @@ def first_speaks(process: TrainingProcess) -> Iterator[None]:
             _say(process, error)
         raise
     except Exception as error:
-        if process.processes == 1:
+        if process.processes == 1 or interruption(error) is not None:
             raise
         from attentionvote.training.processes import is_echo
 
