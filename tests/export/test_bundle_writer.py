@@ -68,7 +68,8 @@ def test_a_full_disk_is_named_and_nothing_half_written_stays(write: Callable, tm
             write()
         assert not list(disk.iterdir())
         resize(disk, "100m")
-        assert (disk / "latest").resolve() == write().path
+        bundle = write()
+        assert (disk / "latest").resolve() == bundle.path
 
 
 def test_no_private_key_lies_in_it(write: Callable) -> None:
