@@ -154,6 +154,7 @@ def test_impossible_networks_and_devices_are_refused_before_generation(words: li
         ("model.confidence=exponential", "model.confidence must be quality with model.refinement.*refinement=null"),
         ("model.centers=[64,80,16,8]", "centers must fall from level to level"),
         ("trainer.accelerator=gpu", "trainer settings cannot be met: .*gpu"),
+        ("trainer.precision=16-mixed", "trainer.precision=16-mixed must be trained on a GPU, got the CPU"),
         ("trainer.schedule.milestones=[5,2]", "milestones must be rising"),
     ):
         if torch.cuda.is_available() and "gpu" in more:
