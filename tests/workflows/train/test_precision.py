@@ -16,7 +16,7 @@ from attentionvote.command.configuration import compose
 from attentionvote.command.identity import without
 from attentionvote.workflows.train import precision as precision_module
 from attentionvote.workflows.train.job import find_training
-from attentionvote.workflows.train.precision import check_precision, resolved_precision
+from attentionvote.workflows.train.precision import check_precision, device_type, resolved_precision
 from attentionvote.workflows.train.settings import TrainSettings
 
 
@@ -98,3 +98,12 @@ def test_half_precision_on_a_cpu_is_refused() -> None:
         ("auto", "32-true", "cpu"),
     ]:  # fmt: skip
         check_precision(setting, precision, device)
+
+
+def test_the_device_is_the_one_that_lightning_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [device_type(name) for name in ("cpu", "gpu", "cuda", "mps")] == ["cpu", "cuda", "cuda", "mps"]
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert device_type("auto") == "cuda"
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+    assert device_type("auto") == "cpu"

@@ -28,6 +28,17 @@ def resolved_precision(trainer: TrainerSettings, gpu: bool | None = None) -> str
     return GPU_PRECISION if gpu else CPU_PRECISION
 
 
+def device_type(accelerator: str) -> str:
+    """Type of the device that Lightning trains on, as torch names it."""
+    import torch
+
+    if accelerator != "auto":
+        return {"gpu": "cuda"}.get(accelerator, accelerator)
+    if torch.cuda.is_available():
+        return "cuda"
+    return "mps" if torch.backends.mps.is_available() else "cpu"
+
+
 def check_precision(setting: str, precision: str, device: str) -> None:
     """Whether a training is where its precision belongs.
 

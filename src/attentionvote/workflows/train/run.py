@@ -25,7 +25,7 @@ from attentionvote.workflows.train.beginning import checkpoint_of, take_over, ta
 from attentionvote.workflows.train.data import prepare_data
 from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
 from attentionvote.workflows.train.pieces import cloud_settings, data_module, pose_training
-from attentionvote.workflows.train.precision import check_precision
+from attentionvote.workflows.train.precision import check_precision, device_type
 from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
 from attentionvote.workflows.train.results import SplitDetections, assess, best_score, detect_everything, log_losses
 from attentionvote.workflows.train.settings import TrainSettings
@@ -49,6 +49,7 @@ class TrainingRun:
     def __init__(self, cfg: TrainSettings, job: TrainingJob, process: TrainingProcess, first_does: FirstDoes) -> None:
         self.cfg, self.job, self.part = cfg, job, job.part
         self.process, self.first_does = process, first_does
+        check_precision(cfg.trainer.precision, job.precision, device_type(cfg.trainer.accelerator))
         L.seed_everything(cfg.seed, verbose=False)
         self.threads = cfg.trainer.threads or process.cores
         torch.set_num_threads(self.threads)
@@ -57,7 +58,6 @@ class TrainingRun:
         self.progress, self.pictures, self.checkpoint_files = TrainingProgress(), ScenePictures(), AtomicCheckpoints()
         with quiet_lightning():
             self.trainer = lightning_trainer(cfg, job, process, [self.progress, self.pictures], self.checkpoint_files)
-        check_precision(cfg.trainer.precision, job.precision, self.trainer.strategy.root_device.type)
         # Lightning itself does so only after the average of the weights was set up and a checkpoint was loaded.
         self.trainer.precision_plugin.convert_module(self.module)
 
