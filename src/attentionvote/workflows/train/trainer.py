@@ -61,7 +61,7 @@ def lightning_trainer(
         return L.Trainer(
             accelerator=t.accelerator,
             **process.trainer_arguments(),
-            precision=job.precision,
+            precision=job.precision,  # type: ignore[arg-type]
             max_epochs=t.max_epochs,
             max_steps=-1 if t.max_steps is None else t.max_steps,
             accumulate_grad_batches=t.accumulate_grad_batches,
