@@ -19,6 +19,7 @@ UNITS ?=
 RUN ?=
 TRIALS ?=
 TO ?=
+VERSION ?=
 DIR ?=
 ARGS ?=
 PYTEST_ARGS ?=
@@ -44,7 +45,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback history score serve keys bench bench-serve image generate view check-data write-data part ui test test-fast lint format clean
+.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback reproduce history score serve keys bench bench-serve image generate view check-data write-data part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -109,6 +110,9 @@ promote: $(STAMP) ## Register the exported model, make it champion if every gate
 
 rollback: $(STAMP) ## Bring the champion before back, or a former one: OBJECT=connecting_rod [TO=3]
 	@$(PY) pipelines/rollback.py $(object) $(if $(TO),to=$(TO)) $(ARGS)
+
+reproduce: $(STAMP) ## Make a registered version again and compare: OBJECT=connecting_rod [VERSION=3]
+	@$(PY) pipelines/reproduce.py $(object) $(if $(VERSION),version=$(VERSION)) $(ARGS)
 
 history: $(STAMP) ## Show who moved the champion, when, from where to where, and why: OBJECT=connecting_rod
 	@$(PY) pipelines/history.py $(object) $(ARGS)

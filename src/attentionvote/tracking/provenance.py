@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -170,5 +171,5 @@ def hardware() -> dict[str, str]:
 
 
 def command_line() -> str:
-    """How the process was started."""
-    return " ".join(sys.argv)
+    """How the process was started, as a shell takes it."""
+    return shlex.join(sys.argv)

@@ -73,6 +73,18 @@ class RollbackSettings(VerbSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReproduceSettings(VerbSettings):
+    """Which registered version is made again."""
+
+    verb: ClassVar[str] = "reproduce"
+    object: Target
+    version: Annotated[int | None, Setting("Of the registry; null = the champion.", low=1, high=1_000_000_000)]
+    outputs: Annotated[str, Setting("Where its data, training and comparison go.")]
+    workers: Annotated[int | None, WORKERS]
+    tracking: Store
+
+
+@dataclass(frozen=True, kw_only=True)
 class HistorySettings(VerbSettings):
     """Whose decisions are shown."""
 
