@@ -2,9 +2,9 @@
 
     make reproduce OBJECT=connecting_rod [VERSION=3]
 
-VERSION left out is the champion. Says what differs from then (commit, packages, processor); on the same machine scenes,
-weights and figures are equal to the bit, elsewhere the figures lie within the interval of their paired difference, or the
-exit code is 1. Everything goes below outputs/reproduce; interrupted, the same command goes on.
+VERSION left out is the champion. Says what differs from then (commit, packages, processor). On the same machine scenes,
+weights and figures are equal to the bit; elsewhere the figures lie within the interval of their paired difference, or
+the exit code is 1. Everything goes below outputs/reproduce; interrupted, the same command goes on.
 """
 
 from __future__ import annotations

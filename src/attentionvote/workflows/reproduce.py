@@ -82,9 +82,8 @@ def recorded(cfg: ReproduceSettings, folder: Path) -> Recorded:
     result = json.loads(fetched(RESULT).read_text(encoding="utf-8"))
     model = fetched(f"checkpoints/{MODEL}")
     run = versions.client.get_run(version.run_id)
-    scenes = {
-        k.removeprefix("data."): v for k, v in run.data.params.items() if k in ("data.train", "data.val", "data.test")
-    }
+    splits = ("train", "val", "test")
+    scenes = {split: run.data.params[f"data.{split}"] for split in splits if f"data.{split}" in run.data.params}
     names = ("git.commit", "git.dirty", "hardware.cpu")
     origin = {k: v for k, v in sorted(run.data.tags.items()) if k in names or k.startswith("version.")}
     return Recorded(version.number, version.run_id, settings, scenes, origin, result, model)
@@ -95,11 +94,8 @@ def differences(then: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     from attentionvote.tracking import provenance
 
     git = provenance.git_state(Path.cwd())
-    now = {
-        "git.commit": git.commit,
-        "git.dirty": str(git.is_dirty).lower(),
-        "hardware.cpu": provenance.hardware()["cpu"],
-    }
+    now = {"git.commit": git.commit, "git.dirty": str(git.is_dirty).lower()}
+    now |= {"hardware.cpu": provenance.hardware()["cpu"]}
     now |= {f"version.{name}": version for name, version in provenance.package_versions().items()}
     return {name: (value, now[name]) for name, value in then.items() if now.get(name, value) != value}
 
@@ -187,9 +183,15 @@ def _trained_again(cfg: ReproduceSettings, was: Recorded) -> dict[str, Any]:
     folder = Path(cfg.outputs).absolute() / str(cfg.object.name) / f"config-{was.version}"
     write_whole(folder / CONFIG, yaml.safe_dump(was.settings, sort_keys=False))
     words = {
-        "root": _root(cfg), "outputs": str(Path(cfg.outputs).absolute() / "train"), "tracking.store": cfg.tracking.store,
-        "tracking.parent": None, "executor": "local", "resume": "auto", "force": False, "workers": cfg.workers,
-    }  # fmt: skip
+        "root": _root(cfg),
+        "outputs": str(Path(cfg.outputs).absolute() / "train"),
+        "tracking.store": cfg.tracking.store,
+        "tracking.parent": None,
+        "executor": "local",
+        "resume": "auto",
+        "force": False,
+        "workers": cfg.workers,
+    }
     flags = [f"--config-dir={folder}", f"--config-name={Path(CONFIG).stem}"]
     outcome = JobProcess(SCRIPTS / "train.py", [*flags, *(f"{k}={json.dumps(v)}" for k, v in words.items())]).result()
     if outcome.code == INTERRUPTED:

@@ -24,6 +24,7 @@ from attentionvote.files import read_json, write_whole
 from attentionvote.workflows.sweep.space import Setting
 from attentionvote.workflows.sweep.study import CRASHES, Ledger
 from attentionvote.workflows.train.job import RUN
+from attentionvote.workflows.train.settings import TrainSettings
 
 MARK = "Written by make sweep"  # files without it are the user's, and never replaced
 _LEAST_FOR_IMPORTANCE = 4  # complete trials
