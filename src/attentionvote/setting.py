@@ -191,7 +191,8 @@ def wanted(type_: Any, setting: Setting, with_noun: bool) -> str:
             wanted(member, setting if member in (int, float) else Setting(""), True) for member in get_args(type_)
         )
     if not isinstance(type_, type) or type_ not in _NOUNS:
-        return "a section" if dataclasses.is_dataclass(type_) else setting.range_text() or "a list"
+        section = dataclasses.is_dataclass(type_) or get_origin(type_) is dict
+        return "a section" if section else setting.range_text() or "a list"
     bounds = setting.range_text()
     if bounds and not with_noun:
         return bounds
