@@ -97,6 +97,14 @@ def test_every_kind_gives_values_and_words_that_compose(base: TrainSettings) -> 
     assert {s.name: s.value(stored[s.name]) for s in space} == values
 
 
+def test_a_setting_that_conf_leaves_out_is_searched_too(base: TrainSettings) -> None:
+    entry = {"name": "trainer.accumulate_grad_batches", "kind": "int", "low": 1, "high": 2}
+    (setting,) = parse_space([entry], base)
+    words = ["object=brick", "experiment=smoke", "trainer.accumulate_grad_batches=2"]
+    assert compose(TrainSettings, words).trainer.accumulate_grad_batches == 2
+    assert setting.extremes == (1, 2)
+
+
 @pytest.mark.parametrize("name", choices("sweep"))
 def test_the_spaces_of_conf_fit_the_preset_of_their_name(name: str) -> None:
     assert (CONF / "experiment" / f"{name}.yaml").is_file()

@@ -14,6 +14,7 @@ from attentionvote.command.configuration import leaves
 from attentionvote.command.errors import ConfigurationError, nearest
 from attentionvote.command.identity import identifies
 from attentionvote.section import check_value
+from attentionvote.section import leaves as fields_below
 from attentionvote.setting import Setting as AnySetting
 from attentionvote.setting import SettingError, scalar_problem
 from attentionvote.workflows.train.job import find_training
@@ -79,7 +80,8 @@ def parse_space(entries: Sequence[Mapping[str, Any]], base: TrainSettings) -> li
     Raises:
         ConfigurationError: with one sentence, when an entry is unknown, impossible or out of range.
     """
-    defaults = dict(leaves(base.composed))
+    left_out = {key: field.default for key, field in fields_below(TrainSettings) if field.default is not ...}
+    defaults = left_out | dict(leaves(base.composed))
     if not entries:
         raise ConfigurationError("sweep.space must have at least one setting, got none")
     settings = [_setting(entry, defaults) for entry in entries]
