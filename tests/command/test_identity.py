@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -51,18 +50,22 @@ def test_a_setting_says_whether_it_identifies() -> None:
         assert not identifies(TrainSettings, name)
 
 
-# Folders of trainings by version 0.1 and 0.2 at their first day, computed by those.
+# Folders of trainings, computed by commit 11bac4c, before settings said whether they identify.
 OF_BEFORE = {
     "object=brick": "07c4fb994275",
+    "object=connecting_rod experiment=votenet seed=3": "d6be5de89287",
+    "object=industrial": "7a3258f24b86",
+    "object=gear experiment=smoke trainer.log_every_steps=7": "c66d0b8f1658",
+    "object=gear object.title=x": "0eac54870e3d",
 }
 
 
 @pytest.mark.parametrize(("words", "digest"), OF_BEFORE.items())
 def test_a_training_of_before_is_found_where_it_lies(words: str, digest: str, tmp_path: Path) -> None:
-    def folder(*more: str) -> Any:
-        return find_training(compose(TrainSettings, [*words.split(), f"outputs={tmp_path}", *more])).directory
-
-    assert folder().name != digest
-    (tmp_path / "brick" / digest).mkdir(parents=True)
-    assert folder() == tmp_path / "brick" / digest
-    assert folder("seed=1").name != digest
+    cfg = compose(TrainSettings, [*words.split(), f"outputs={tmp_path}"])
+    new = find_training(cfg).directory
+    assert new.name != digest
+    (new.parent / digest).mkdir(parents=True)
+    assert find_training(cfg).directory.name == digest
+    new.mkdir()  # begun under its new name since
+    assert find_training(cfg).directory == new
