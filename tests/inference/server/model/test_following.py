@@ -75,13 +75,14 @@ def test_promoted_rolled_back_and_alone(
     with continuous_requests(server, body) as answers:
         own_registry.register(name, bundles["2"])  # champion by the same call
         server.wait_until(lambda: answers[-1]["model"] == second, "it moves to version 2")
-        assert registered(server) == {"name": name, "version": "2"}
+        server.wait_until(lambda: registered(server) == {"name": name, "version": "2"}, "it names version 2")
         own_registry.move(name, "champion", "1")
         server.wait_until(lambda: answers[-1]["model"] == first, "it returns to version 1")
     best = {answer["model"]: answer["poses"][0]["confidence"] for answer in answers}
     assert best == {first: pytest.approx(0.95), second: pytest.approx(0.9)}
     digest = load_bundle(bundles["1"], None).digest
-    assert server.metric("registry_info", digest=digest, model=name, version="1") == 1
+    information = {"digest": digest, "model": name, "version": "1"}
+    server.wait_until(lambda: server.metric("registry_info", **information) == 1, "the metric names version 1")
     assert server.metric("registry_failing") == 0
 
     own_registry.kill()
