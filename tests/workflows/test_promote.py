@@ -19,6 +19,7 @@ import warm_starter
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError, Refused
+from attentionvote.files import FolderUnavailable
 from attentionvote.inference.bundles.signature import make_keys
 from attentionvote.registry.versions import Versions
 from attentionvote.tracking.run_opening import start_run
@@ -169,7 +170,7 @@ def test_what_cannot_be_done_is_said_before_any_work(verb, model, tmp_path):
         verb("promote", "gates.floors.ap_10=2")
     model("one")
     (tmp_path / "data").write_text("a file")
-    with pytest.raises(OSError, match="data"):
+    with pytest.raises(FolderUnavailable, match="data/scenes/brick/.* cannot be written: Not a directory"):
         verb("promote")
 
 
