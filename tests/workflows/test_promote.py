@@ -170,7 +170,7 @@ def test_what_cannot_be_done_is_said_before_any_work(verb, model, tmp_path):
         verb("promote", "gates.floors.ap_10=2")
     model("one")
     (tmp_path / "data").write_text("a file")
-    with pytest.raises(FolderUnavailable, match="data/scenes/brick/.* cannot be written: Not a directory"):
+    with pytest.raises(FolderUnavailable, match=r"data/scenes/brick/.* cannot be written: Not a directory"):
         verb("promote")
 
 
