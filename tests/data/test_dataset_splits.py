@@ -135,7 +135,7 @@ def test_an_export_finds_the_test_scenes_again(training: Path, box: Part, tmp_pa
         "clouds": {"sensor": {"preset": "none"}, "density": 900, "pool": 400, "neighbors": 12},
     }
     scenes = held_out.find_test_scenes(metadata, box, tmp_path)
-    settings = held_out.cloud_settings(metadata)
+    settings = CloudSettings.of(metadata["clouds"])
     assert settings.sensor == Sensor("none")
     clouds = held_out.measured(scenes, box, settings, tmp_path, 1)
     whole = dict(held_out.whole_clouds(scenes, box, settings, [0, 3]))
