@@ -14,6 +14,7 @@ import pytest
 from written_piles import pile_records, write_piles
 
 from attentionvote.data.dataset_splits import DatasetSplits
+from attentionvote.data.sensing import CloudSettings
 from attentionvote.export import held_out
 from attentionvote.part import Part
 from attentionvote.simulation.sensor import Sensor

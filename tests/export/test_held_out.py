@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from attentionvote.data.sensing import sense
+from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.export import held_out
 from attentionvote.export.checkpoint_card import model_card
 from attentionvote.model.network import AttentionVote
@@ -95,7 +95,7 @@ def test_samples_and_sensor_clouds_are_of_the_same_measurement(
     root: Path, part: Part, metadata: dict[str, Any], network: AttentionVote
 ) -> None:
     scenes = held_out.find_test_scenes(metadata, part, root)
-    settings = held_out.cloud_settings(metadata)
+    settings = CloudSettings.of(metadata["clouds"])
     clouds = held_out.measured(scenes, part, settings, root, workers=1)
     drawn = list(held_out.samples(clouds, [1, 3], 300, network.layout))
     again = list(held_out.samples(clouds, [3], 300, network.layout))
