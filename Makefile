@@ -45,7 +45,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback reproduce history score serve keys bench bench-serve image generate view check-data write-data part ui test test-fast lint format clean
+.PHONY: help setup system train sweep fleet benchmark smoke export evaluate promote rollback reproduce history prune score serve keys bench bench-serve image generate view check-data write-data part ui test test-fast lint format clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -116,6 +116,9 @@ reproduce: $(STAMP) ## Make a registered version again and compare: OBJECT=conne
 
 history: $(STAMP) ## Show who moved the champion, when, from where to where, and why: OBJECT=connecting_rod
 	@$(PY) pipelines/history.py $(object) $(ARGS)
+
+prune: $(STAMP) ## Show data, trainings and bundles that nobody refers to, with sizes: [ARGS=remove=true removes them]
+	@$(PY) pipelines/prune.py $(ARGS)
 
 score: $(STAMP) ## Score any method's result files, Sileane's or BOP's: ARGS="gt=DIR results=DIR poseutils=FILE"
 	@$(PY) pipelines/score.py $(ARGS)

@@ -23,6 +23,7 @@ from attentionvote.files import (
     locked_folder,
     naming_full_disk,
     read_json,
+    remove_folder,
     remove_leftovers,
     waiting_lock,
     whole,
@@ -187,3 +188,32 @@ def test_a_place_for_reading_only_is_one_sentence(tmp_path: Path) -> None:
         with refused, waiting_lock(tmp_path / ".lock"):
             pass
         assert not is_locked(tmp_path)
+
+
+def test_a_folder_is_removed_with_what_a_killed_removal_left(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    for path in (folder, tmp_path / ".removed-set"):  # the second of a killed process
+        path.mkdir()
+        (path / "manifest.json").touch()
+        (path / "data").touch()
+    remove_folder(folder, "manifest.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_waits_for_the_lock_of_a_folder_that_is_removed_gets_a_new_one(tmp_path: Path) -> None:
+    folder, entered = tmp_path / "set", []
+
+    def second() -> None:
+        with waiting_lock(folder / ".lock"):
+            (folder / "made").touch()
+            entered.append(is_locked(folder))
+
+    with waiting_lock(folder / ".lock"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        thread.join(0.2)
+        remove_folder(folder)
+        assert not folder.exists()
+    thread.join(10)
+    assert entered == [True]
+    assert (folder / "made").is_file()

@@ -14,9 +14,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 log = logging.getLogger("attentionvote.files")
+REMOVED = ".removed-"  # begins the name of a folder that is being removed
 
 
 class FolderUnavailable(ValueError):
@@ -165,12 +166,14 @@ def locked_folder(folder: Path, outputs: str, work: str, setting: str = "outputs
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, also on kill -9
         except BlockingIOError as error:
             raise FolderUnavailable(f"another process is at this {work} ({folder}): wait for it, or end it") from error
+        if not _is_at(lock, folder / ".lock"):
+            raise FolderUnavailable(f"another process removed this {work} just now ({folder}): start it again")
         yield
 
 
 @contextmanager
 def waiting_lock(path: Path) -> Iterator[None]:
-    """Wait until no other process holds this file, and hold it; its folder is made.
+    """Wait until no other process holds this file, and hold it; its folder is made, again when it was removed.
 
     Raises:
         FolderUnavailable: when its folder cannot be written.
@@ -178,17 +181,46 @@ def waiting_lock(path: Path) -> Iterator[None]:
     """
     import fcntl
 
+    while True:
+        try:
+            with naming_full_disk(path.parent):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                lock = path.open("w")
+        except DiskFull:
+            raise
+        except OSError as error:
+            raise FolderUnavailable(f"{path.parent} cannot be written: {error.strerror or error}") from error
+        with lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
+            if _is_at(lock, path):
+                yield
+                return
+
+
+def _is_at(lock: IO[str], path: Path) -> bool:
+    """Whether the open file is still the one of this name: its folder may have been removed while it was locked."""
     try:
-        with naming_full_disk(path.parent):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            lock = path.open("w")
-    except DiskFull:
-        raise
-    except OSError as error:
-        raise FolderUnavailable(f"{path.parent} cannot be written: {error.strerror or error}") from error
-    with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel, also on kill -9
-        yield
+        return os.path.samestat(os.fstat(lock.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def remove_folder(folder: Path, *first: str) -> None:
+    """Remove a folder whose lock this process holds: under its name it is there whole or not at all.
+
+    What a kill leaves has a name that begins with ``REMOVED``.
+
+    Args:
+        folder: whose parent stays.
+        first: the files in it that say it is complete; they are gone before anything else is.
+    """
+    moved = folder.with_name(REMOVED + folder.name)
+    if moved.exists():  # of a killed process
+        shutil.rmtree(moved)
+    folder.rename(moved)
+    for name in first:
+        (moved / name).unlink(missing_ok=True)
+    shutil.rmtree(moved)
 
 
 def is_locked(folder: Path) -> bool:

@@ -204,6 +204,10 @@ class Versions:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
 
+    def has_run(self, run_id: str) -> bool:
+        """Whether the store has the run of a training."""
+        return self._run(run_id) is not None
+
     def _run(self, run_id: str) -> Any:
         """The run of an id, or None when the store does not have it."""
         from mlflow.exceptions import MlflowException

@@ -108,10 +108,34 @@ def load_trained(path: Path | str) -> tuple[AttentionVote, dict[str, Any]]:
         ValueError: with one sentence, when the file cannot be read or is none of this project's.
         FileNotFoundError: when there is no such file.
     """
+    content = _read(path)
+    metadata: dict[str, Any] = content[KEY]
+    try:
+        model = AttentionVote.from_arguments(metadata["model"])
+        weights = content["state_dict"].items()
+        model.load_state_dict({name.removeprefix(_PREFIX): v for name, v in weights if name.startswith(_PREFIX)})
+    except (RuntimeError, TypeError, KeyError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ValueError(f"checkpoint {path} does not fit this version's network: {reason}") from error
+    return model.eval(), metadata
+
+
+def read_metadata(path: Path | str) -> dict[str, Any]:
+    """The metadata of a checkpoint alone, see :func:`load_trained`; weights are not read.
+
+    Raises:
+        ValueError, FileNotFoundError: as there.
+    """
+    metadata: dict[str, Any] = _read(path, mmap=True)[KEY]
+    return metadata
+
+
+def _read(path: Path | str, mmap: bool = False) -> dict[str, Any]:
+    """The content of a checkpoint of ours."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"checkpoint {path} must exist: train one with `make train`")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:  # torch raises a dozen kinds for torn files
         raise ValueError(
             f"checkpoint {path} cannot be read ({type(error).__name__}): it is torn or no checkpoint"
@@ -124,11 +148,4 @@ def load_trained(path: Path | str) -> tuple[AttentionVote, dict[str, Any]]:
             f"checkpoint {path} must have format {FORMAT}, got {metadata.get('format')}: "
             f"it was written by attentionvote {metadata.get('version', 'of an unknown version')}"
         )
-    try:
-        model = AttentionVote.from_arguments(metadata["model"])
-        weights = content["state_dict"].items()
-        model.load_state_dict({name.removeprefix(_PREFIX): v for name, v in weights if name.startswith(_PREFIX)})
-    except (RuntimeError, TypeError, KeyError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise ValueError(f"checkpoint {path} does not fit this version's network: {reason}") from error
-    return model.eval(), metadata
+    return dict(content)

@@ -29,8 +29,11 @@ _TITLES = {
 def described(job: EvaluationJob, frozen: MeasuredScenes, measured: Measurement) -> dict[str, Any]:
     """What was measured, and on what: the dictionary of the JSON line.
 
-    For figures see ``figures_of``; ``frozen`` is whether the scenes are those whose digest is recorded, None without.
+    For figures see ``figures_of``; ``scene_set`` is the digest of generated scenes without the sensor, None of a
+    dataset's; ``frozen`` is whether the scenes are those whose digest is recorded, None without.
     """
+    from attentionvote.measurement.scenes import EvaluationSet
+
     return {
         "stage": "evaluate",
         "object": job.part.name,
@@ -38,6 +41,7 @@ def described(job: EvaluationJob, frozen: MeasuredScenes, measured: Measurement)
         "run_id": job.bundle.card.run_id,
         "signed_by": job.signer,
         "evaluation_set": frozen.digest,
+        "scene_set": frozen.scenes.digest if isinstance(frozen, EvaluationSet) else None,
         "frozen": is_recorded(job.cfg, job.part, frozen),
         "sensor": frozen.title,
         "scenes": len(frozen),

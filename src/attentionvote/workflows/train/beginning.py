@@ -82,12 +82,20 @@ def take_weights(model: nn.Module, path: Path, init: str) -> None:
 
 
 def take_over(earlier: Path, folder: Path) -> None:
-    """Copy the checkpoints of a training of fewer epochs to where a longer one goes on from them."""
+    """Copy the checkpoints of a training of fewer epochs to where a longer one goes on from them, if they are there."""
     import torch
 
     from attentionvote.training.checkpoint import write_atomically
 
-    for file in sorted((earlier / "checkpoints").glob("*.ckpt")):
+    files = sorted((earlier / "checkpoints").glob("*.ckpt"))
+    if not files:
+        log.info(
+            "trained anew, because the checkpoints of %s are gone (make prune); init=%s takes its weights",
+            earlier,
+            earlier,
+        )
+        return
+    for file in files:
         content = torch.load(file, map_location="cpu", weights_only=True)
         write_atomically(_moved(content, str(earlier), str(folder)), folder / "checkpoints" / file.name)
     log.info("going on after the last epoch of %s", earlier)

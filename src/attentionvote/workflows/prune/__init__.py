@@ -1,0 +1,1 @@
+"""Data, trainings, checkpoints and bundles that nobody refers to: shown, removed on request."""
