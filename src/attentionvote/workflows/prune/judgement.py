@@ -42,9 +42,9 @@ class PartJudgement:
 
     def judge(self) -> Findings:
         """Everything about the part."""
-        runs = {thing.run_id for thing in [*self.trainings, *self.bundles]} - {""}
+        runs = {training.run_id for training in self.trainings} | {bundle.run_id for bundle in self.bundles}
         try:
-            self.named, has_runs = references(self.cfg.tracking.store, self.part, sorted(runs))
+            self.named, has_runs = references(self.cfg.tracking.store, self.part, sorted(runs - {""}))
             self.has_runs = dict(has_runs)
         except ConnectionError as error:
             self._unjudged(f"bundles, trainings and data of {self.part} are kept, because {error}")

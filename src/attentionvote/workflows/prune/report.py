@@ -29,8 +29,10 @@ def show(things: Sequence[Unreferenced], unfinished: Sequence[Unreferenced], fre
 
     listed = [*things, *unfinished]
     rows = [(t.kind, escape(t.part), escape(str(t.path)), f"{t.age_days:.1f}", amount(t.bytes)) for t in listed]
-    if rows:
-        show_table(("kind", "part", "where", "days old", "size"), rows, numbers=("days old", "size"))
+    if not rows:
+        log.info("there is nothing that nobody refers to")
+        return
+    show_table(("kind", "part", "where", "days old", "size"), rows, numbers=("days old", "size"))
     sums = [(kind, [t for t in listed if t.kind == kind]) for kind in (*KINDS, "unfinished")]
     groups = [(kind, group) for kind, group in sums if group] + [("total", listed)]
     paths = {thing.path for thing in freed}
