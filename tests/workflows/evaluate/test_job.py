@@ -32,6 +32,8 @@ def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_
     result = run(f"tracking.store={store}")
     assert (result["bundle"], result["run_id"], result["scenes"]) == (bundle.digest, training.id, 2)
     assert result["working_point"] == 0.5
+    (generated,) = tmp_path.rglob("evaluation-*/manifest.json")
+    assert result["scene_set"] == json.loads(generated.read_text())["content_digest"]
     assert {"ap_10", "ap_5", "ap_2", "recall_10", "latency_p50_ms", "latency_p95_ms"} <= set(result["figures"])
     assert set(result["intervals"]) == {"ap_10", "ap_5", "ap_2", "precision_10", "recall_10"}
     said = " ".join(capsys.readouterr().err.split())
