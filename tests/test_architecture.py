@@ -125,7 +125,7 @@ def test_scripts_are_doors_and_no_library_imports_them() -> None:
     assert not imported & names
     lines = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in SCRIPTS}
     assert {name: count for name, count in lines.items() if count > 100} == {}
-    assert len(lines) <= 20
+    assert len(lines) <= 21
 
 
 def test_every_verb_has_one_stem_everywhere() -> None:
