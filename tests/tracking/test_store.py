@@ -22,6 +22,7 @@ from attentionvote.tracking.store import (
     has_password,
     resolve_store,
     shown,
+    sqlite_file,
 )
 
 
@@ -60,6 +61,39 @@ def test_resolve_store_prefers_the_argument_then_the_environment_then_outputs(mo
 def test_resolve_store_rejects_with_the_nearest_choice(store, sentence):
     with pytest.raises(ValueError, match=sentence):
         resolve_store(store)
+
+
+@pytest.mark.parametrize("name", ["x%20y", "a?b", "c#d", "100%", "é ;'@ 日本"])
+def test_a_store_lies_in_its_folder_whatever_that_is_called(name, tmp_path, monkeypatch):
+    folder = tmp_path / name
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    uri = resolve_store(None)
+    assert resolve_store(uri) == uri
+    assert sqlite_file(uri) == folder / "outputs/mlflow.db"
+    run = start_run(None, "rod", system_interval_s=0, repository=tmp_path)
+    run.log_text("notes/a.txt", name)
+    assert run.download("notes/a.txt", tmp_path / "fetched").read_text() == name
+    run.close()
+    assert [file.read_text() for file in (folder / "outputs/mlartifacts").rglob("a.txt")] == [name]
+    model = connect(uri).create_logged_model(run.experiment_id, name="m")
+    connect(uri).log_model_artifacts(model.model_id, str(tmp_path / "fetched"))
+    assert (folder / "outputs/mlartifacts/models" / model.model_id / "artifacts/a.txt").is_file()
+    assert {path.name for path in tmp_path.iterdir()} == {name, "fetched"}
+
+
+def test_an_address_that_would_be_the_neighbour_s_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("x%20y", "x y"):
+        (tmp_path / folder).mkdir()
+    with pytest.raises(ValueError, match=r"must be percent-encoded .*nearest: 'sqlite:///.*/x%2520y/m.db'"):
+        resolve_store(f"sqlite:///{tmp_path}/x%20y/m.db")
+    with pytest.raises(ValueError, match=r"must be percent-encoded .*nearest: 'sqlite:///.*/a%3Fb/m.db'"):
+        resolve_store("sqlite:///a?b/m.db")
+    assert sqlite_file(resolve_store("x%20y/m.db")) == tmp_path / "x%20y/m.db"
+    assert sqlite_file(resolve_store("sqlite:///x y/m.db")) == tmp_path / "x y/m.db"
+    (tmp_path / "x%20y").rmdir()
+    assert sqlite_file(resolve_store("sqlite:///x%20y/m.db")) == tmp_path / "x y/m.db"
 
 
 @pytest.mark.parametrize(
@@ -120,9 +154,12 @@ def test_connect_rejects_a_file_that_is_no_database(tmp_path):
 def test_deleted_experiment_comes_back(database, tmp_path):
     client = connect(database)
     first = experiment_id(client, database, "rod")
+    assert client.get_experiment(first).tags["mlflow.experimentKind"] == "custom_model_development"
+    client.delete_experiment_tag(first, "mlflow.experimentKind")  # of an earlier version
     client.delete_experiment(first)
     assert experiment_id(client, database, "rod") == first
     assert client.get_experiment(first).lifecycle_stage == "active"
+    assert client.get_experiment(first).tags["mlflow.experimentKind"] == "custom_model_development"
     folder = tmp_path / ("mlartifacts" if database.startswith("sqlite") else "outputs/mlartifacts")
     assert client.get_experiment(first).artifact_location == folder.as_uri()
 

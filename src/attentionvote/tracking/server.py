@@ -15,7 +15,14 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from attentionvote.tracking.store import artifact_root, connect, is_server, quiet_environment, resolve_store
+from attentionvote.tracking.store import (
+    artifact_root,
+    connect,
+    is_server,
+    quiet_environment,
+    resolve_store,
+    without_stray_folder,
+)
 
 # Run before the server's own program, in its process: the kernel ends it when whoever started it is gone, however that
 # ended; MLflow hands the signal on to its child. 1 is PR_SET_PDEATHSIG, which outlives exec.
@@ -73,7 +80,7 @@ def serve(store: str | None = None, port: int = 0, timeout_s: float = 180.0) -> 
     command += ["-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     command += ["--artifacts-destination", root.as_uri()]
     url = f"http://127.0.0.1:{port}"
-    with tempfile.TemporaryFile() as output:
+    with tempfile.TemporaryFile() as output, without_stray_folder(uri):
         # Its own session: the server's children end with it, and Ctrl-C reaches us alone.
         process = subprocess.Popen(
             command, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True

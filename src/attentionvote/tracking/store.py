@@ -7,22 +7,23 @@ import difflib
 import logging
 import os
 import re
-import urllib.error
-import urllib.request
+import urllib.parse
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from attentionvote.files import DiskFull, disk_full, remove_leftovers, waiting_lock, whole
+from attentionvote.tracking.server_check import CREDENTIALS, check_access, check_health, check_version
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 SERVERS = ("http", "https")
-_CREDENTIALS = "set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"
 _DATABASE_PATIENCE_S = 10
+# By it MLflow opens an experiment on its runs, charts and models instead of the pages for language models.
+KIND = {"mlflow.experimentKind": "custom_model_development"}
 _ADVISORY_LOCK = 0x617474766F7465  # "attvote": one number of ours among everybody's locks in that database
 # Before the import of MLflow: no telemetry, no chatter; a dead server fails within seconds rather than minutes,
 # because our own writers retry in the background anyway. Existing settings of the user win.
@@ -41,26 +42,28 @@ def resolve_store(store: str | None) -> str:
     """The store's URI: the argument, else ``MLFLOW_TRACKING_URI``, else ``outputs/mlflow.db`` of the working directory.
 
     Args:
-        store: ``sqlite:///relative/or/absolute.db``, ``http(s)://host:port``, a database URI, or the path of an
-            SQLite file that ends in ``.db``.
+        store: the path of an SQLite file that ends in ``.db``, as it is; ``sqlite:///relative/or/absolute.db``, in
+            which ``%``, ``?`` and ``#`` of the path are percent-encoded, as SQLAlchemy reads it; ``http(s)://host:port``
+            or a database URI.
 
     Raises:
-        ValueError: the URI has another scheme, with the nearest valid one; a server's address holds a password, or a
-            database's holds one that cannot be told from its host.
+        ValueError: the URI has another scheme, with the nearest valid one; it may mean another file than it seems to; a
+            server's address holds a password, or a database's holds one that cannot be told from its host.
     """
     store = store or os.environ.get("MLFLOW_TRACKING_URI") or "outputs/mlflow.db"
     if "://" not in store and not store.startswith(("file:", "sqlite:")) and store.endswith(".db"):
-        store = f"sqlite:///{store}"
+        return _sqlite_uri(Path(store))
     scheme = store.split(":", 1)[0].split("+", 1)[0] if ":" in store else ""
     if scheme == "sqlite":
         path = re.sub(r"^sqlite(\+\w+)?:///", "", store)
         if path == store or not path:
             raise ValueError(f"an SQLite tracking store must read sqlite:///PATH.db, got {store!r}")
-        return f"sqlite:///{Path(path).expanduser().absolute()}"
+        _check_encoding(store, path)
+        return _sqlite_uri(Path(urllib.parse.unquote(path)))
     if scheme in SERVERS:
         if "@" in store.split("://", 1)[-1].partition("/")[0]:
             raise ValueError(
-                f"a tracking server's address must not hold user and password, got {shown(store)!r}: {_CREDENTIALS}"
+                f"a tracking server's address must not hold user and password, got {shown(store)!r}: {CREDENTIALS}"
             )
         return store.rstrip("/")
     if scheme in DATABASES:
@@ -80,6 +83,40 @@ def resolve_store(store: str | None) -> str:
     raise ValueError(
         f"tracking store must start with one of {', '.join(choices)}, got {shown(store)!r}, nearest: '{near}://'"
     )
+
+
+def _sqlite_uri(path: Path) -> str:
+    text = os.fspath(path.expanduser().absolute())
+    for letter in "%?#":  # first the % of the others
+        text = text.replace(letter, f"%{ord(letter):02X}")
+    return f"sqlite:///{text}"
+
+
+def _check_encoding(store: str, path: str) -> None:
+    """Refuse a path that is there as it stands: SQLAlchemy would write into another file, without a word."""
+    literal = Path(path).expanduser()
+    if "?" in path or (urllib.parse.unquote(path) != path and literal.parent.is_dir()):
+        raise ValueError(
+            f"the path in an SQLite tracking store's address must be percent-encoded (% is %25, ? is %3F), got "
+            f"{store!r}, nearest: {_sqlite_uri(literal)!r}"
+        )
+
+
+def sqlite_file(uri: str) -> Path | None:
+    """The file of a resolved store, None for another kind."""
+    path = uri.removeprefix("sqlite:///")
+    return None if path == uri else Path(urllib.parse.unquote(path))
+
+
+@contextlib.contextmanager
+def without_stray_folder(uri: str) -> Iterator[None]:
+    """Remove the empty folder that MLflow makes for an SQLite file whose address is percent-encoded."""
+    stray = Path(uri.removeprefix("sqlite:///")).parent
+    is_ours = sqlite_file(uri) is not None and "%" in os.fspath(stray) and not stray.exists()
+    yield
+    if is_ours:
+        with contextlib.suppress(OSError):
+            os.removedirs(stray)
 
 
 def shown(store: str) -> str:
@@ -103,8 +140,8 @@ def artifact_root(uri: str) -> Path | None:
     """Folder of the artefacts of a store on this machine, None for a server."""
     if is_server(uri):
         return None
-    if uri.startswith("sqlite:///"):
-        return Path(uri.removeprefix("sqlite:///")).parent / "mlartifacts"
+    if (file := sqlite_file(uri)) is not None:
+        return file.parent / "mlartifacts"
     return Path("outputs/mlartifacts").absolute()
 
 
@@ -118,9 +155,8 @@ def exclusive(uri: str) -> Iterator[None]:
     Raises:
         Exception: SQLAlchemy's, when PostgreSQL cannot be reached.
     """
-    if uri.startswith("sqlite:///"):
-        path = Path(uri.removeprefix("sqlite:///"))
-        with waiting_lock(path.with_name(path.name + ".lock")):
+    if (file := sqlite_file(uri)) is not None:
+        with waiting_lock(file.with_name(file.name + ".lock")):
             yield
     elif uri.startswith("postgresql"):
         from sqlalchemy import create_engine, text
@@ -135,43 +171,6 @@ def exclusive(uri: str) -> Iterator[None]:
         yield
 
 
-def _check_health(uri: str) -> None:
-    try:
-        with urllib.request.urlopen(f"{uri}/health", timeout=10):
-            pass
-    except urllib.error.HTTPError as error:
-        if error.code == 403:
-            raise ConnectionError(
-                f"tracking server {uri} refuses its own address (HTTP 403); start it with --allowed-hosts naming it"
-            ) from error
-        # Any other answer is an answer: a proxy may hide /health.
-    except OSError as error:
-        reason = getattr(error, "reason", error)
-        raise ConnectionError(
-            f"tracking server {uri} must answer, got: {reason}; "
-            "start it, or unset MLFLOW_TRACKING_URI for the local store"
-        ) from error
-
-
-def _check_access(client: MlflowClient, uri: str) -> None:
-    """/health is open to everybody: ask something that only users are told."""
-    from mlflow.exceptions import MlflowException
-    from mlflow.utils.credentials import read_mlflow_creds
-
-    try:
-        client.search_experiments(max_results=1)
-    except MlflowException as error:
-        status = error.get_http_status_code()
-        if status not in (401, 403):
-            sentence = str(error).strip().splitlines()[0]
-            raise ConnectionError(f"tracking server {uri} must answer as MLflow does, got: {sentence}") from error
-        user = read_mlflow_creds().username
-        refusal = f"it refuses those of {user!r}" if user else "it got none"
-        raise ConnectionError(
-            f"tracking server {uri} must be given user and password, {refusal} (HTTP {status}): {_CREDENTIALS}"
-        ) from error
-
-
 def quiet_environment() -> None:
     """Set MLflow's switches that must be set before its import."""
     for name, value in ENVIRONMENT.items():
@@ -182,12 +181,12 @@ def connect(uri: str) -> MlflowClient:
     """A client of the store; creates a database's tables, safely when several processes do so at once.
 
     Raises:
-        ConnectionError: a server does not answer, or wants other credentials than it was given.
+        ConnectionError: a server does not answer, wants other credentials than it was given, or is too old.
         DiskFull: a database on this machine has no room.
         ValueError: the store cannot be used (for example tables of another MLflow version).
     """
     if is_server(uri):
-        _check_health(uri)
+        check_health(uri)
     quiet_environment()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # MLflow's dependencies deprecate each other at import
@@ -197,7 +196,7 @@ def connect(uri: str) -> MlflowClient:
     for name in ("urllib3.connectionpool", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
     try:
-        with exclusive(uri), warnings.catch_warnings(), _naming_full_disk(uri):
+        with exclusive(uri), without_stray_folder(uri), warnings.catch_warnings(), _naming_full_disk(uri):
             warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
             _create_database(uri)
             client = MlflowClient(uri, registry_uri=uri)
@@ -211,7 +210,8 @@ def connect(uri: str) -> MlflowClient:
         sentence = str(error).strip().splitlines()[0]
         raise ValueError(f"tracking store {shown(uri)} cannot be opened: {sentence}") from error
     if is_server(uri):
-        _check_access(client, uri)
+        check_access(client, uri)
+        check_version(uri)
     return client
 
 
@@ -220,7 +220,8 @@ def _naming_full_disk(uri: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # of SQLAlchemy or MLflow, around SQLite's
-        full = disk_full(error, Path(uri.removeprefix("sqlite:///")).parent) if uri.startswith("sqlite:///") else None
+        file = sqlite_file(uri)
+        full = None if file is None else disk_full(error, file.parent)
         if full is None:
             raise
         raise full from error
@@ -228,8 +229,8 @@ def _naming_full_disk(uri: str) -> Iterator[None]:
 
 def _create_database(uri: str) -> None:
     """Make a new SQLite file whole or not at all: half of MLflow's tables, of a full disk or a kill, open no more."""
-    path = Path(uri.removeprefix("sqlite:///"))
-    if uri.startswith("sqlite:///") and not path.exists():
+    path = sqlite_file(uri)
+    if path is not None and not path.exists():
         for name in (path.name, f"{path.name}-journal"):
             remove_leftovers(path.with_name(name))
         whole(path, _make_tables)
@@ -274,11 +275,14 @@ def _ensured_experiment(client: MlflowClient, uri: str, name: str) -> str:
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
         try:
-            return client.create_experiment(name, artifact_location=root.as_uri() if root else None)
+            return client.create_experiment(name, artifact_location=root.as_uri() if root else None, tags=KIND)
         except MlflowException:  # somebody else was faster (a server has no lock of ours)
             experiment = client.get_experiment_by_name(name)
             if experiment is None:
                 raise
     if experiment.lifecycle_stage == "deleted":
         client.restore_experiment(experiment.experiment_id)
+    for tag, kind in KIND.items():
+        if tag not in experiment.tags:
+            client.set_experiment_tag(experiment.experiment_id, tag, kind)
     return experiment.experiment_id
