@@ -1,16 +1,19 @@
 """A run on a real SQLite store: contents, resume, statuses."""
 
+import getpass
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warm_starter
 
+from attentionvote.tracking.datasets import RunDataset
 from attentionvote.tracking.run import status_of
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.store import connect
@@ -27,7 +30,7 @@ def client(store):
 def test_start_run_records_what_it_was_given_and_where_it_comes_from(store, client, tmp_path):
     run = start_run(
         store, "rod", name="first", params={"lr": 0.001}, config_yaml="lr: 0.001\n", tags={"object": "rod"},
-        datasets={"train": DIGEST}, system_interval_s=0,
+        datasets={"train": RunDataset(DIGEST, "rod/train", Path("/data/rod"), {"scenes": 3})}, system_interval_s=0,
     )  # fmt: skip
     run.log_metrics({"val/ap@10": 0.5, "train/loss/vote": np.float32(2)}, 7)
     run.log_text("notes/a.txt", "hello")
@@ -40,7 +43,11 @@ def test_start_run_records_what_it_was_given_and_where_it_comes_from(store, clie
     assert stored.info.run_name == "first"
     assert stored.data.params == {"lr": "0.001", "data.train": DIGEST}
     assert stored.data.metrics == {"val/ap_10": 0.5, "train/loss/vote": 2.0}
-    assert stored.inputs.dataset_inputs[0].dataset.digest == DIGEST[:32]
+    (data,) = [entry.dataset for entry in stored.inputs.dataset_inputs]
+    assert (data.name, data.digest) == ("rod/train", DIGEST[:32])
+    assert json.loads(data.source) == {"uri": "/data/rod", "digest": DIGEST}
+    assert json.loads(data.profile) == {"scenes": 3, "digest": DIGEST}
+    assert stored.data.tags["user"] == stored.data.tags["mlflow.user"] == getpass.getuser()
     assert stored.data.tags["object"] == "rod"
     assert stored.data.tags["version.torch"] == environment["versions"]["torch"]
     assert int(stored.data.tags["hardware.cores"]) >= 1
@@ -77,6 +84,32 @@ def test_resume_keeps_parameters_repairs_status_and_continues_series(store, clie
     assert json.loads(stored.data.tags["resumed_with_other_params"]) == {"lr": {"was": "1", "now": "2"}}
     assert stored.data.tags["sessions"] == "1"
     assert "resumed with other parameters" in caplog.text
+
+
+def test_a_table_is_one_and_a_person_s_description_stays(store, client):
+    import mlflow
+
+    run = start_run(store, "rod", system_interval_s=0)
+    for value in (1.0, 2.0):  # the newest counts
+        run.log_table("test/a.json", [{"figure": "ap", "value": value}, {"figure": "n", "value": 3}])
+    run.log_table("test/b.json", [])
+    run.describe("ours")
+    run.close()
+    client.set_tag(run.id, "mlflow.note.content", "theirs")
+    again = start_run(store, "rod", run_id=run.id, system_interval_s=0)
+    again.describe("ours")
+    again.log_table("test/b.json", [])
+    again.close()
+    tags = client.get_run(run.id).data.tags
+    assert tags["mlflow.note.content"] == "theirs"
+    assert [entry["path"] for entry in json.loads(tags["mlflow.loggedArtifacts"])] == ["test/a.json", "test/b.json"]
+    mlflow.set_tracking_uri(store)
+    try:
+        table = client.load_table(run.experiment_id, "test/a.json", [run.id])
+    finally:
+        mlflow.set_tracking_uri(None)
+        os.environ.pop("MLFLOW_TRACKING_URI", None)
+    assert table.to_dict("list") == {"figure": ["ap", "n"], "value": [2.0, 3.0]}
 
 
 def test_resume_of_an_unknown_run_is_one_sentence(store):

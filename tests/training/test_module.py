@@ -109,12 +109,18 @@ def quiet() -> Iterator[None]:
 
 
 def fit(
-    module: PoseTraining, data: Batches, *callbacks: Callback, epochs: int = 2, precision: Any = "32-true"
+    module: PoseTraining,
+    data: Batches,
+    *callbacks: Callback,
+    epochs: int = 2,
+    precision: Any = "32-true",
+    clip: float | None = 5.0,  # a part of every training; not every optimizer allows it in every precision
+    log_every: int = 50,
 ) -> L.Trainer:
     trainer = L.Trainer(
         accelerator="cpu", max_epochs=epochs, logger=False, callbacks=list(callbacks), enable_progress_bar=False,
         enable_checkpointing=False, enable_model_summary=False, num_sanity_val_steps=0, precision=precision,
-        gradient_clip_val=5.0,  # a part of every training; not every optimizer allows it in every precision
+        gradient_clip_val=clip, log_every_n_steps=log_every,
     )  # fmt: skip
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*LeafSpec.*")
@@ -158,6 +164,43 @@ def test_the_warm_up_trains_votes_in_a_larger_radius(make_module: Callable[..., 
     module.model.voting_radius = 17.0
     module.detect(data.batches[1][0])
     assert module.model.voting_radius == radius  # inference never looks further
+
+
+class Norms(Callback):
+    """The norm of the gradients before they are clipped, what is logged of it, and the rate of the step."""
+
+    def __init__(self) -> None:
+        self.before: list[float] = []
+        self.logged: list[float] = []
+        self.rates: list[float] = []
+        self.steps: list[float] = []
+
+    def on_before_optimizer_step(self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any) -> None:
+        del trainer
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        self.before.append(float(torch.sqrt(sum((g.double() ** 2).sum() for g in gradients))))  # type: ignore[arg-type]
+        self.steps.append(optimizer.param_groups[0]["lr"])
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        self.logged.append(float(trainer.callback_metrics["train/gradient_norm"]))
+        self.rates.append(float(trainer.callback_metrics["train/learning_rate"]))
+
+
+@pytest.mark.parametrize("clip", [1e-3, None, 0.0])
+def test_norm_and_rate_are_logged_and_steps_stay_lightning_s(
+    make_module: Callable[..., PoseTraining], data: Batches, clip: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, norms = make_module(schedule=Schedule("cosine", vote_steps=1)), Norms()
+    fit(module, data, norms, clip=clip, log_every=1)
+    assert norms.logged == pytest.approx(norms.before, rel=1e-5)
+    assert norms.rates == norms.steps  # to the last digit
+    assert norms.rates[0] == 0.003
+    assert norms.rates[-1] < norms.rates[0]
+    monkeypatch.delattr(PoseTraining, "configure_gradient_clipping")
+    plain = make_module(schedule=Schedule("cosine", vote_steps=1))
+    fit(plain, data, clip=clip)
+    for ours, theirs in zip(module.parameters(), plain.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_training_lowers_the_loss(make_module: Callable[..., PoseTraining], data: Batches) -> None:

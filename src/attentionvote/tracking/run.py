@@ -11,12 +11,13 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
 from attentionvote.tracking.artifact_writer import ArtifactWriter
+from attentionvote.tracking.datasets import RunDataset, dataset_inputs
 from attentionvote.tracking.metric_writer import MetricWriter
 from attentionvote.tracking.store import is_server
 from attentionvote.tracking.system_metrics import SystemSampler
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 PARAM_LIMIT = 6000  # MLflow's limit for a value
+# Tags that MLflow's pages read: the description, and which artefacts are tables.
+NOTE_TAG, TABLES_TAG = "mlflow.note.content", "mlflow.loggedArtifacts"
 
 
 def status_of(error: BaseException | None) -> Status:
@@ -63,6 +66,8 @@ class Run:
         self.status: str = "RUNNING"
         self._client = client
         self._params: dict[str, str] = dict(stored.data.params)
+        self._described = NOTE_TAG in stored.data.tags
+        self._tables = [entry["path"] for entry in json.loads(stored.data.tags.get(TABLES_TAG, "[]"))]
         last_steps = {metric.key: metric.step for metric in stored.data.to_proto().metrics}
         self._metrics = MetricWriter(client, run_id, last_steps)
         self._artifacts = ArtifactWriter(client, run_id, stored.info.artifact_uri)
@@ -133,19 +138,30 @@ class Run:
             name = str(path.with_suffix("") / f"step_{step:08d}{path.suffix}")
         self._artifacts.put_bytes(figure, name)
 
-    def log_datasets(self, datasets: Mapping[str, str]) -> None:
-        """Record the data: full digests as params, and as MLflow datasets (whose digests hold 36 characters only)."""
-        from mlflow.entities import Dataset, DatasetInput, InputTag
+    def log_table(self, name: str, rows: Sequence[Mapping[str, object]]) -> None:
+        """Store rows as an artefact that MLflow's pages show as a table and ``mlflow.load_table`` reads.
 
-        self.log_params({f"data.{name}": digest for name, digest in datasets.items()})
-        inputs = [
-            DatasetInput(
-                Dataset(name=name, digest=digest[:32], source_type="local", source=json.dumps({"digest": digest})),
-                [InputTag("mlflow.data.context", name)],
-            )
-            for name, digest in datasets.items()
-        ]
-        self._try("datasets", lambda: self._client.log_inputs(self.id, inputs))
+        Args:
+            name: of the artefact, ``.json``.
+            rows: with the columns of the first.
+        """
+        columns = list(rows[0]) if rows else []
+        table = {"columns": columns, "data": [[row[column] for column in columns] for row in rows]}
+        self.log_text(name, json.dumps(table))
+        if name not in self._tables:
+            self._tables.append(name)
+            self.log_tags({TABLES_TAG: json.dumps([{"path": path, "type": "table"} for path in self._tables])})
+
+    def describe(self, text: str) -> None:
+        """Give the run a description (Markdown), unless it has one: a person's stays."""
+        if not self._described:
+            self.log_tags({NOTE_TAG: text})
+            self._described = True
+
+    def log_datasets(self, datasets: Mapping[str, RunDataset]) -> None:
+        """Record the data by use: full digests as params, and as MLflow's datasets."""
+        self.log_params({f"data.{use}": data.digest for use, data in datasets.items()})
+        self._try("datasets", lambda: self._client.log_inputs(self.id, dataset_inputs(datasets)))
 
     def metric_history(self, name: str) -> tuple[list[int], list[float]]:
         """Steps and values of a metric in step order, everything queued included; for figures of the whole run."""

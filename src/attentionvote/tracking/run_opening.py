@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import getpass
 import json
 import logging
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from attentionvote.tracking import provenance
+from attentionvote.tracking.datasets import RunDataset
 from attentionvote.tracking.run import Run, status_of
 from attentionvote.tracking.store import connect, experiment_id, resolve_store, shown
 
@@ -37,7 +38,7 @@ def start_run(
     params: Mapping[str, object] | None = None,
     config_yaml: str = "",
     tags: Mapping[str, object] | None = None,
-    datasets: Mapping[str, str] | None = None,
+    datasets: Mapping[str, RunDataset] | None = None,
     repository: Path | None = None,
     system_interval_s: float = 15.0,
     parent: str | None = None,
@@ -49,10 +50,10 @@ def start_run(
         experiment: created when new. A resumed run stays in its own.
         name: shown in the UI.
         run_id: of the run to resume, whatever ended it (kill -9 included); None for a new one.
-        params: a short set that identifies the run; immutable, see :meth:`Run.log_params`.
+        params: what identifies the run, by dotted name; immutable, see :meth:`Run.log_params`.
         config_yaml: the full resolved configuration, stored as ``config.yaml``.
         tags: free labels.
-        datasets: full digest by use (``{"train": sha256}``).
+        datasets: what it is made with, by use (``train`` ...).
         repository: folder whose git state is recorded; the working directory by default.
         system_interval_s: seconds between samples of the machine's load, 0 for none.
         parent: id of the run that this one is shown below, in the same store; a resumed run that has a parent keeps it.
@@ -128,5 +129,6 @@ def _record_origin(run: Run, session: int, config_yaml: str, repository: Path) -
             )
         run.log_text(f"{folder}{PATCH}", git.patch)
         run.log_text(f"{folder}uncommitted_status.txt", git.status)
-    with contextlib.suppress(KeyError):
-        run.log_tags({"mlflow.user": os.environ["USER"]})
+    with contextlib.suppress(OSError, KeyError):  # a container's user may have no name
+        user = getpass.getuser()
+        run.log_tags({"mlflow.user": user, "user": user})

@@ -9,6 +9,7 @@ from typing import Any, Self
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.plugins.precision import MixedPrecision
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +24,7 @@ from attentionvote.training import processes
 from attentionvote.training.checkpoint import KEY, load_trained
 from attentionvote.training.detections import scene_results
 from attentionvote.training.losses import AttentionVoteLoss
-from attentionvote.training.optimization import optimizer_of, paper_rate
+from attentionvote.training.optimization import clip_gradient, optimizer_of, paper_rate
 from attentionvote.training.proposal_counts import ProposalCounts, proposal_counts
 from attentionvote.training.schedule import RateSchedule, Schedule
 from attentionvote.training.step import batch_loss
@@ -88,7 +89,7 @@ class PoseTraining(L.LightningModule):
         return module.eval()
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        """One step; logs every term of the loss under ``train/loss/``."""
+        """One step; logs every term of the loss under ``train/loss/``, and ``train/learning_rate``."""
         ramp = self.schedule.ramp(self.global_step)
         self.model.voting_radius = self.voting_radius * (self.schedule.vote_radius_factor if ramp < 1 else 1.0)
         terms = batch_loss(self.model, self.loss, batch, ramp, self.train_heat)
@@ -96,8 +97,24 @@ class PoseTraining(L.LightningModule):
         whole = processes.summed(torch.stack([*terms.values(), total]))
         names = [*(f"train/loss/{k}" for k in terms), "train/loss"]
         self.log_dict(dict(zip(names, whole, strict=True)), batch_size=len(batch.points))
+        rate = self.trainer.optimizers[0].param_groups[0]["lr"]
+        self.log("train/learning_rate", torch.as_tensor(rate, dtype=torch.float64), batch_size=len(batch.points))
         # The gradients of several processes are averaged, but their parts of the loss add up.
         return total * processes.count()
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip the gradients by their norm, and log it as it was before: ``train/gradient_norm``."""
+        most, precision = gradient_clip_val or 0.0, self.trainer.precision_plugin
+        mixed = isinstance(precision, MixedPrecision) and getattr(optimizer, "_step_supports_amp_scaling", False)
+        if most and mixed:  # Lightning refuses it, in words of its own
+            self.clip_gradients(optimizer, most, gradient_clip_algorithm)
+        if most or (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # a norm for nothing costs time
+            self.log("train/gradient_norm", clip_gradient(precision.main_params(optimizer), most))
 
     def on_validation_epoch_start(self) -> None:
         """Nothing is found yet."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from attentionvote.section import Factory
@@ -43,6 +43,19 @@ def optimizer_of(
         groups = [{"params": everything}]
     made: Optimizer = kind(groups, **more)
     return made
+
+
+def clip_gradient(weights: Iterable[nn.Parameter], most: float) -> Tensor:
+    """Scale gradients down to a norm, as Lightning does; returns the norm that they had.
+
+    Args:
+        weights: with their gradients, in the order of the optimizer.
+        most: largest norm; 0 = not clipped.
+    """
+    everything = list(weights)
+    if most > 0:
+        return torch.nn.utils.clip_grad_norm_(everything, most)
+    return torch.nn.utils.get_total_norm([weight.grad for weight in everything if weight.grad is not None])
 
 
 def paper_rate(schedule: Schedule, optimizer: Optimizer, total_steps: int, epoch_steps: int) -> dict[str, Any]:

@@ -39,6 +39,7 @@ TINY = [
 ]  # fmt: skip
 
 
+CURVES = ("loss/vote", "learning_rate", "gradient_norm")
 CHEAP = pytest.mark.usefixtures("cheap_figures")
 
 
@@ -197,8 +198,9 @@ def test_the_whole_chain(
     assert {
         "config.yaml", "result.json", "train/losses.png", "test/precision_recall.png", "test/ap_threshold.png",
         "test/scene_0.png", "val/scene_0/step_00000004.png", "val/scene_1/step_00000012.png",
-        "checkpoints/model.ckpt", "checkpoints/best_val_ap.ckpt", "checkpoints/last.ckpt",
+        "checkpoints/model.ckpt", "checkpoints/best_val_ap.ckpt", "checkpoints/last.ckpt", "test/figures.json",
     } <= names  # fmt: skip
+    check_record(store, result, folder)
 
     # Complete: the stored result, without another training.
     caplog.clear()
@@ -209,12 +211,48 @@ def test_the_whole_chain(
     # The model is gone: only the test is done again, in the same run.
     request.getfixturevalue("cheap_figures")
     (folder / "model.ckpt").unlink()
-    again = run(words)
+    caplog.clear()
+    again = run(words, "data.workers=1", "trainer.threads=2", "tracking.system_interval=60", "trainer.log_every_steps=7")
+    assert "resumed with other parameters" not in caplog.text  # they do not identify the training
     assert (again["run_id"], again["metrics"], again["steps"]) == (result["run_id"], result["metrics"], 12)
     # Repeated on demand, in a run of its own.
     repeated = run(words, "force=true")
     assert repeated["run_id"] != result["run_id"]
     assert all(torch.equal(a, b) for a, b in zip(weights(repeated).values(), weights(again).values(), strict=True))
+
+
+def check_record(store: str, result: dict[str, Any], folder: Path) -> None:
+    """What MLflow's pages show of a complete training: settings, tags, datasets, metrics, a table, a description."""
+    import mlflow.data
+
+    from attentionvote.tracking.store import connect, resolve_store
+
+    client = connect(resolve_store(store))
+    stored = client.get_run(result["run_id"])
+    params, tags, metrics = stored.data.params, stored.data.tags, stored.data.metrics
+    assert params["object"] == "brick"
+    assert (params["epochs"], params["trainer.max_epochs"], params["learning_rate"]) == ("6", "6", "0.003")
+    assert params["model.centers"] == "[64, 32, 16, 8]"
+    assert {"loss.weights.vote", "data.sensor.preset", "trainer.average_decay", "simulation.cycles.train"} <= set(params)
+    outside = ("tracking.", "cluster.", "trainer.threads", "trainer.log_every", "workers", "root", "outputs", "data.held")
+    assert not [name for name in params if name.startswith(outside)]
+    assert stored.info.run_name == f"brick smoke s0 6e {folder.name[:6]}"
+    assert (tags["preset"], tags["part"], tags["sensor"], tags["seed"]) == ("smoke", "brick", "gaussian", "0")
+    assert len(tags["part.digest"]) == 64
+    assert "| ap_10 |" in tags["mlflow.note.content"]
+    tests = {name for name in metrics if name.startswith("test/")}
+    assert {"test/ap_10", "test/ap_5", "test/ap_2", "test/confidence_threshold"} <= tests
+    assert len(tests) <= 9
+    assert {"train/learning_rate", "train/gradient_norm"} <= set(metrics)
+    table = json.loads(Path(client.download_artifacts(result["run_id"], "test/figures.json")).read_text())
+    assert dict(table["data"]).keys() == result["metrics"].keys()
+    assert json.loads(tags["mlflow.loggedArtifacts"]) == [{"path": "test/figures.json", "type": "table"}]
+    data = {entry.tags[0].value: entry.dataset for entry in stored.inputs.dataset_inputs}
+    assert set(data) == {"train", "val", "test"}
+    profile = json.loads(data["train"].profile)
+    assert (data["train"].name, profile["scenes"], profile["cycles"]) == ("brick/train", 8, 4)
+    assert profile["digest"] == params["data.train"]
+    assert (Path(mlflow.data.get_source(data["train"]).uri) / "manifest.json").is_file()
 
 
 class Full:
@@ -333,8 +371,9 @@ def test_killed_anywhere_and_continued_ends_the_same(
     histories = []
     for r in (whole, result):
         with start_run(store, run_id=r["run_id"], system_interval_s=0) as tracked:
-            histories.append(tracked.metric_history("train/loss/vote"))
-    assert histories[0] == histories[1]  # one unbroken curve
+            histories.append({name: tracked.metric_history(f"train/{name}") for name in CURVES})
+    assert histories[0] == histories[1]  # unbroken curves
+    assert all(steps == list(range(32)) for steps, _ in histories[0].values())
 
 
 @pytest.mark.slow

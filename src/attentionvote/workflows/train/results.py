@@ -23,6 +23,11 @@ from attentionvote.training.processes import in_order
 from attentionvote.training.proposal_counts import ProposalCounts, proposal_figures
 
 log = logging.getLogger("attentionvote.train")
+# Figures of the test that are metrics of the run, to plot and compare; all of them are rows of a table.
+HEADLINES = (
+    "ap_10", "ap_5", "ap_2", "precision_10", "recall_10", "proposal_recall", "center_error_mm", "rotation_error_deg",
+)  # fmt: skip
+FIGURES = "test/figures.json"
 _LEAST_HISTORY = 10  # logged steps from which on it can be said whether a loss fell
 
 
@@ -59,6 +64,8 @@ def assess(
 ) -> dict[str, Any]:
     """Judge what was found in scenes never seen, log the figures, write ``model_file``; for the first process.
 
+    The headlines become metrics of the run, all figures the table ``test/figures.json``.
+
     The confidence threshold is chosen on the validation scenes.
 
     Returns:
@@ -68,7 +75,9 @@ def assess(
     results = detections["test"].results
     threshold = best_threshold(detections["val"].results, module.part)
     metrics = evaluate_at(results, module.part, threshold) | proposal_figures(detections["test"].proposals)
-    tracked.log_metrics({f"test/{k}": v for k, v in metrics.items()} | {"test/confidence_threshold": threshold}, step)
+    headlines = {f"test/{name}": metrics[name] for name in HEADLINES if name in metrics}
+    tracked.log_metrics(headlines | {"test/confidence_threshold": threshold}, step)
+    tracked.log_table(FIGURES, [{"figure": name, "value": value} for name, value in metrics.items()])
     metadata = module.metadata | {"confidence_threshold": threshold, "test": metrics}
     save_trained(module.model, metadata, model_file)
     tracked.log_file("checkpoints/model.ckpt", model_file)

@@ -29,7 +29,7 @@ from attentionvote.workflows.train.precision import check_precision, device_type
 from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
 from attentionvote.workflows.train.results import SplitDetections, assess, best_score, detect_everything, log_losses
 from attentionvote.workflows.train.settings import TrainSettings
-from attentionvote.workflows.train.tracking import open_tracking
+from attentionvote.workflows.train.tracking import description, open_tracking
 from attentionvote.workflows.train.trainer import lightning_trainer, made
 
 log = logging.getLogger("attentionvote.train")
@@ -87,9 +87,7 @@ class TrainingRun:
                 return None
             if self.cfg.trainer.dev_batches:
                 return self._tried(self._fit(data, None))
-            with open_tracking(
-                self.job, self.module, self._choices(), self.process.processes, self.cfg.tracking, self.cfg.yaml()
-            ) as tracked:
+            with open_tracking(self.cfg, self.job, self.module, self.process.processes) as tracked:
                 progress = self._fit(data, tracked)
                 losses = log_losses(tracked)
                 weights, detections = self._detect(data)
@@ -111,6 +109,7 @@ class TrainingRun:
                     "commit": tracked.commit,
                 }
                 tracked.log_text("result.json", json.dumps(result, indent=2))
+                tracked.describe(description(self.job, self.module, result))
                 write_json(self.job.directory / RESULT, result)
         log.info(
             "AP %s at 10/5/2 %% D; see the run with `make ui`",
@@ -127,22 +126,6 @@ class TrainingRun:
             "steps": self.trainer.global_step,
             "train_seconds": round(progress.seconds, 1),
         }
-
-    def _choices(self) -> dict[str, object]:
-        """What tells trainings apart at a glance: parameters of the run."""
-        cfg = self.cfg
-        choices: dict[str, object] = {
-            "object": self.part.name,
-            "diameter": self.part.diameter,
-            "seed": cfg.seed,
-            "points": cfg.data.points,
-            "parameters": sum(p.numel() for p in self.module.model.parameters()),
-            "train_scenes": self.job.scene_counts["train"],
-            "epochs": cfg.trainer.max_epochs,
-            "batch_size": cfg.trainer.batch_size,
-            "learning_rate": cfg.trainer.learning_rate,
-        }
-        return choices if self.job.dataset is None else choices | {"dataset": str(self.job.dataset)}
 
     @property
     def _checkpoints(self) -> Path:
