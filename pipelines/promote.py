@@ -16,11 +16,14 @@ from attentionvote.workflows.settings import PromoteSettings
 
 def run(cfg: PromoteSettings) -> dict[str, Any]:
     """Measure, judge, register, move; the decision."""
+    from attentionvote.tracking.server_check import store_failures
+    from attentionvote.tracking.store import shown
     from attentionvote.workflows.promote import PromotionJob
 
     with configuring():
         job = PromotionJob.find(cfg)
-    return job.already() or job.run()
+    with store_failures(shown(job.versions.uri)):
+        return job.already() or job.run()
 
 
 if __name__ == "__main__":

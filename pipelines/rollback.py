@@ -24,6 +24,8 @@ def run(cfg: RollbackSettings) -> dict[str, Any]:
     from attentionvote.registry.history import History
     from attentionvote.registry.promotion import Superseded, move, stand, target
     from attentionvote.registry.versions import Versions
+    from attentionvote.tracking.server_check import store_failures
+    from attentionvote.tracking.store import shown
     from attentionvote.workflows.evaluate.job import trusted_key
 
     with configuring():
@@ -47,7 +49,8 @@ def run(cfg: RollbackSettings) -> dict[str, Any]:
         "before": before,
     }
     try:
-        move(versions, history, standing, "rollback", version, cfg.why)
+        with store_failures(shown(versions.uri)):
+            move(versions, history, standing, "rollback", version, cfg.why)
     except Superseded as error:
         raise Refused(str(error), answer) from error
     log.info("%s: version %d is the champion again, instead of %s", cfg.object.name, version.number, before or "none")

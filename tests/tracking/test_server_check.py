@@ -14,7 +14,7 @@ from attentionvote.tracking.store import connect
 
 @contextmanager
 def answering(version: str, status: int = 200) -> Iterator[str]:
-    """The answers that a real server of MLflow 2.22.0 gave, but for its version: that package cannot stand beside ours."""
+    """What a real server of MLflow 2.22.0 answered, but for its version: that package cannot stand beside ours."""
 
     class Answers(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

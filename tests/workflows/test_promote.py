@@ -81,6 +81,12 @@ def test_from_promotion_to_rollback(verb, model, store, capsys):
     assert (champion.digest, champion.tags["decision"]) == (second.digest, "promoted")
     assert champion.tags["gate.parity"].startswith("holds: a proof of parity")
     assert champion.tags["evaluation.set"] == done["evaluation_set"]
+    assert champion.tags["ap_10"] == f"{done['figures']['ap_10']:.4f}"  # a number alone, to sort by
+    page = versions.client.get_model_version(versions.name, "2").description
+    assert f"| ap_10 | {done['figures']['ap_10']:.4f} |" in page
+    assert "16 of 16 gates hold" in page
+    measured = versions.client.get_run(champion.run_id).data.metrics
+    assert measured["evaluation/ap_10"] == pytest.approx(done["figures"]["ap_10"], abs=1e-6)
     assert verb("promote")["promoted"] is False  # it is the champion already: nothing is measured
     back = verb("rollback", "why='misses parts'")
     assert (back["version"], back["before"], back["bundle"]) == (1, 2, first.digest)

@@ -17,6 +17,11 @@ from attentionvote.evaluation.scene_result import Array, SceneResult, distance_t
 from attentionvote.part import Part, Parts
 
 THRESHOLDS = (0.10, 0.05, 0.02)  # of the diameter
+# The figures by which models are compared at a glance, where a model has them.
+HEADLINES = (
+    "ap_10", "ap_5", "ap_2", "precision_10", "recall_10", "proposal_recall", "center_error_mm", "rotation_error_deg",
+    "latency_p50_ms", "latency_p95_ms",
+)  # fmt: skip
 DETAIL_THRESHOLD = 0.10  # at which recall by visibility and pose errors are reported
 VISIBILITY_EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 

@@ -1,8 +1,8 @@
 """The registered versions of one part's model: ``attentionvote-<part>`` in MLflow's registry.
 
-A version's artefacts are a bundle's folder, nothing else: a cell fetches the files that the manifest names. The tag
-``bundle.digest`` says which bundle it is. Aliases: ``candidate`` is the version registered last, ``champion`` the one
-that cells follow.
+A version's artefacts are a bundle's folder, and beside its files those by which MLflow itself loads it: a cell fetches
+the files that the manifest names. The tag ``bundle.digest`` says which bundle it is. Aliases: ``candidate`` is the
+version registered last, ``champion`` the one that cells follow.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attentionvote.inference import Bundle, BundleError, load_bundle
 from attentionvote.inference.bundles.bundle import Trusted
 from attentionvote.registry.gates import Origin
+from attentionvote.registry.logged_model import DIGEST_TAG, Figures, log_model
 from attentionvote.tracking.run_opening import PATCH, SESSION_TAG, session_folder
-from attentionvote.tracking.store import connect, experiment_id, resolve_store
+from attentionvote.tracking.server_check import check_health
+from attentionvote.tracking.store import connect, experiment_id, is_server, resolve_store
 
 if TYPE_CHECKING:
     from mlflow.entities.model_registry import ModelVersion
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 PREFIX = "attentionvote-"
 CHAMPION, CANDIDATE = "champion", "candidate"
-DIGEST_TAG = "bundle.digest"
+UNMEASURED = Figures()
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,16 @@ class Versions:
         """The newest version that is this bundle; None when it was never registered."""
         return next((version for version in reversed(self.all()) if version.digest == digest), None)
 
-    def register(self, bundle: Bundle, tags: Mapping[str, str]) -> Version:
+    def register(
+        self, bundle: Bundle, tags: Mapping[str, str], figures: Figures = UNMEASURED, description: str = ""
+    ) -> Version:
         """Upload a bundle, read it back, and make it a version; the same bundle is registered once.
+
+        Args:
+            bundle: verified.
+            tags: of the version; of one that is there too.
+            figures: that its logged model gets.
+            description: of the version, Markdown; of one that is there too.
 
         Raises:
             OSError: when what the store gives back is not what it got.
@@ -110,29 +121,25 @@ class Versions:
                 if name.startswith("gate.") and name not in tags:  # of an earlier decision
                     self.client.delete_model_version_tag(self.name, str(registered.number), name)
             self.tag(registered, tags)
+            if description:
+                self.client.update_model_version(self.name, str(registered.number), description)
             return registered
         run = self._run(bundle.card.run_id)
         experiment = run.info.experiment_id if run else experiment_id(self.client, self.uri, self.part)
-        run_id = run.info.run_id if run else None
         facts = {DIGEST_TAG: bundle.digest, **tags}
         with self._global_store():
-            model = self.client.create_logged_model(
-                experiment,
-                name=f"{self.part}-{bundle.digest[:12]}",
-                source_run_id=run_id,
-                tags={DIGEST_TAG: bundle.digest},
-                model_type="attentionvote bundle",
-            )
-            self.client.log_model_artifacts(model.model_id, str(bundle.path))
-            with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
-                self._check(bundle.digest, model.artifact_location, Path(folder))
-            self.client.finalize_logged_model(model.model_id, "READY")
+            model = log_model(self.client, experiment, bundle, run, figures, partial(self._check, bundle.digest))
             about = (
                 f"6D pose models of {self.part}; moved by `make promote` and `make rollback`, see {self.name}-history"
             )
             self.create(self.name, {"part": self.part}, about)
             row = self.client.create_model_version(
-                self.name, f"models:/{model.model_id}", run_id=run_id, tags=facts, model_id=model.model_id
+                self.name,
+                f"models:/{model.model_id}",
+                run_id=run.info.run_id if run else None,
+                tags=facts,
+                description=description,
+                model_id=model.model_id,
             )
             self.client.set_registered_model_alias(self.name, CANDIDATE, row.version)
         return _version(row)
@@ -225,17 +232,17 @@ class Versions:
         """Whether a version's artefacts are still the bundle it was registered as."""
         location = self.client.get_model_version_download_uri(self.name, str(version.number))
         try:
-            with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
-                self._check(version.digest, location, Path(folder))
+            self._check(version.digest, location)
         except (OSError, ValueError) as error:
             log.warning("version %d is registered anew: %s", version.number, error)
             return False
         return True
 
-    def _check(self, digest: str, location: str, folder: Path) -> None:
+    def _check(self, digest: str, location: str) -> None:
         """What was stored must be the bundle, bit by bit: a proxy, a full disk or another version may interfere."""
         try:
-            stored = load_bundle(self._download(location, folder), None)
+            with tempfile.TemporaryDirectory(prefix="attentionvote-") as folder:
+                stored = load_bundle(self._download(location, Path(folder)), None)
         except BundleError as error:
             raise OSError(f"the registry must give back the bundle it got, but {error}") from error
         if stored.digest != digest:
@@ -248,6 +255,8 @@ class Versions:
         try:
             return Path(download_artifacts(artifact_uri=location, dst_path=str(folder), tracking_uri=self.uri))
         except (MlflowException, OSError) as error:
+            if is_server(self.uri):
+                check_health(self.uri)
             reason = str(error).strip().split("\n")[0]
             raise ValueError(
                 f"the artefacts of {self.name} must be in the store, but they are not: {reason}"

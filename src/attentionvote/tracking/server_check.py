@@ -1,10 +1,12 @@
-"""What must hold of a tracking server before anything is written to it: it answers, lets us in, is new enough."""
+"""What must hold of a tracking server before anything is written to it, and what is said when it goes away."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -81,3 +83,32 @@ def check_version(uri: str) -> None:
             f"the tracking server at {uri} must be MLflow {OLDEST} or newer, got {version[0]}: upgrade it, or unset "
             "MLFLOW_TRACKING_URI for the local store"
         )
+
+
+@contextlib.contextmanager
+def store_failures(where: str) -> Iterator[None]:
+    """Say in one sentence what a store raises in the middle of work, when its server dies say.
+
+    Args:
+        where: the store as people may see it.
+
+    Raises:
+        ConnectionError: instead of what MLflow and its HTTP client raise.
+    """
+    from mlflow.exceptions import MlflowException
+    from requests import RequestException
+
+    try:
+        yield
+    except (MlflowException, RequestException) as error:
+        raise ConnectionError(
+            f"the tracking store {where} must answer until the work is done, got: {_reason(error)}; run the same "
+            "command again, it goes on from there"
+        ) from error
+
+
+def _reason(error: BaseException) -> str:
+    """What is wrong with a connection, without the names of classes and pools around it."""
+    text = str(error).strip().partition("\n")[0]
+    words = re.search(r"\[Errno -?\d+\] ([^'\")]+)", text) or re.search(r"([Rr]ead timed out|timed out)", text)
+    return words[1] if words else text[:200]

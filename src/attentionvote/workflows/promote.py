@@ -11,12 +11,14 @@ from typing import Any
 
 from attentionvote.command.errors import ConfigurationError, Refused
 from attentionvote.command.tables import show_table
+from attentionvote.evaluation.scores import HEADLINES
 from attentionvote.inference import Bundle
 from attentionvote.inference.bundles.signature import trusted_key
 from attentionvote.measurement.models import Measurement
 from attentionvote.measurement.scenes import MeasuredScenes
 from attentionvote.registry.gates import Evidence, Gate, Rules, judge
 from attentionvote.registry.history import History
+from attentionvote.registry.logged_model import Figures
 from attentionvote.registry.promotion import Standing, Superseded, move, stand
 from attentionvote.registry.versions import DATA_FACT, Version, Versions
 from attentionvote.workflows.evaluate.job import EvaluationJob
@@ -95,8 +97,13 @@ class PromotionJob:
         facts = {f"gate.{gate.name}": str(gate) for gate in gates}
         facts |= {f"{DATA_FACT}{split}": digest for split, digest in self.evaluation.bundle.card.data.items()}
         facts |= {"evaluation.set": frozen.digest, "machine": report["machine"], "compared": against}
+        headlines = {name: report["figures"][name] for name in HEADLINES if name in report["figures"]}
+        numbers = {name: f"{value:.4f}" for name, value in headlines.items()}  # to sort the registry's pages by
         version = self.versions.register(
-            self.evaluation.bundle, facts | {"decision": "refused" if failed else "passed"}
+            self.evaluation.bundle,
+            facts | numbers | {"decision": "refused" if failed else "passed"},
+            Figures(headlines, frozen.digest, f"{self.name}/{self.evaluation.cfg.evaluation.split}"),
+            self._description(report, headlines, gates),
         )
         answer = self._answer(version, report, gates, frozen)
         if failed:
@@ -116,6 +123,29 @@ class PromotionJob:
         self.versions.tag(version, {"decision": "promoted"})
         log.info("%s: version %d is the champion now%s", self.name, version.number, self._instead())
         return answer | {"promoted": True, "champion": version.number}
+
+    def _description(self, report: Mapping[str, Any], headlines: Mapping[str, float], gates: Sequence[Gate]) -> str:
+        """The version's page, in Markdown: figures with intervals, gates, how the model is loaded."""
+        sure, card = report["intervals"], self.evaluation.bundle.card
+        intervals = {name: "{:.3f} to {:.3f}".format(*sure[name]) for name in headlines if name in sure}
+        rows = [f"| {name} | {value:.4f} | {intervals.get(name, '')} |" for name, value in headlines.items()]
+        holding = sum(gate.holds for gate in gates)
+        origin = f"run `{card.run_id}`, commit `{card.commit[:12]}`" if card.run_id else "no run"
+        return "\n".join(
+            [
+                f"**{card.part.title or self.name}**, D = {1000 * card.part.diameter:.1f} mm; "
+                f"{holding} of {len(gates)} gates hold.",
+                "",
+                f"| figure on {report['scenes']} scenes | value | 95 % interval |",
+                "|---|---|---|",
+                *rows,
+                "",
+                f"{report['sensor']}; measured on {report['machine']}; bundle `{report['bundle'][:12]}` of {origin}.",
+                "",
+                f'`mlflow.pyfunc.load_model("models:/{self.versions.name}@champion").predict(points)`, '
+                "points (N, 3) in metres.",
+            ]
+        )
 
     def _champion(self, folder: Path) -> tuple[Bundle | None, str]:
         """The champion's bundle from the registry, or None and why nothing is compared.

@@ -212,7 +212,9 @@ def test_the_whole_chain(
     request.getfixturevalue("cheap_figures")
     (folder / "model.ckpt").unlink()
     caplog.clear()
-    again = run(words, "data.workers=1", "trainer.threads=2", "tracking.system_interval=60", "trainer.log_every_steps=7")
+    again = run(
+        words, "data.workers=1", "trainer.threads=2", "tracking.system_interval=60", "trainer.log_every_steps=7"
+    )
     assert "resumed with other parameters" not in caplog.text  # they do not identify the training
     assert (again["run_id"], again["metrics"], again["steps"]) == (result["run_id"], result["metrics"], 12)
     # Repeated on demand, in a run of its own.
@@ -233,8 +235,19 @@ def check_record(store: str, result: dict[str, Any], folder: Path) -> None:
     assert params["object"] == "brick"
     assert (params["epochs"], params["trainer.max_epochs"], params["learning_rate"]) == ("6", "6", "0.003")
     assert params["model.centers"] == "[64, 32, 16, 8]"
-    assert {"loss.weights.vote", "data.sensor.preset", "trainer.average_decay", "simulation.cycles.train"} <= set(params)
-    outside = ("tracking.", "cluster.", "trainer.threads", "trainer.log_every", "workers", "root", "outputs", "data.held")
+    assert {"loss.weights.vote", "data.sensor.preset", "trainer.average_decay", "simulation.cycles.train"} <= set(
+        params
+    )
+    outside = (
+        "tracking.",
+        "cluster.",
+        "trainer.threads",
+        "trainer.log_every",
+        "workers",
+        "root",
+        "outputs",
+        "data.held",
+    )
     assert not [name for name in params if name.startswith(outside)]
     assert stored.info.run_name == f"brick smoke s0 6e {folder.name[:6]}"
     assert (tags["preset"], tags["part"], tags["sensor"], tags["seed"]) == ("smoke", "brick", "gaussian", "0")

@@ -22,6 +22,7 @@ from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.inference.bundles.external_data import external_tensor
 from attentionvote.inference.bundles.graph_card import card_text
 from attentionvote.inference.bundles.manifest import (
+    BESIDE,
     CARD,
     GOLDEN,
     MANIFEST,
@@ -110,7 +111,7 @@ def load_bundle(path: Path | str, trusted: Trusted) -> Bundle:
             entries = parse_manifest(manifest)
         except BundleError as error:
             raise BundleError(f"{folder}: {error}") from error
-        unlisted = sorted(set(files_in(handle, folder)) - set(entries) - {MANIFEST, SIGNATURE})
+        unlisted = sorted(set(files_in(handle, folder)) - set(entries) - {MANIFEST, SIGNATURE} - BESIDE)
         if unlisted:
             raise BundleError(f"{folder}: {unlisted[0]} is not in {MANIFEST}: remove it, or export the bundle again")
         contents = {}

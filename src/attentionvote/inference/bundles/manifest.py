@@ -23,6 +23,9 @@ from attentionvote.inference.errors import BundleError
 
 MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
 MODEL, CARD, MESH, GOLDEN = "model.onnx", "card.json", "part.ply", "golden"
+# What MLflow keeps beside a registered bundle's files, or writes beside them when it loads them: no part of the bundle,
+# never read here. (By these names alone: anything else that the manifest does not name is refused.)
+BESIDE = frozenset({"MLmodel", "python_env.yaml", "requirements.txt", "registered_model_meta"})
 FORMAT = 1
 _MIB = 1024 * 1024
 # A full-size model has about 10 MiB and a cloud less than one: these bounds only keep a wrong folder from being read.
@@ -57,7 +60,7 @@ def write_manifest(folder: Path, private_key: Ed25519PrivateKey) -> None:
         BundleError: when the folder is no complete bundle, or holds what no bundle may hold.
     """
     with opened(folder) as handle:
-        names = [name for name in files_in(handle, folder) if name not in (MANIFEST, SIGNATURE)]
+        names = [name for name in files_in(handle, folder) if name not in {MANIFEST, SIGNATURE, *BESIDE}]
         entries: dict[str, Entry] = {}
         for name in names:
             _check_name(name, folder)
@@ -178,7 +181,7 @@ def files_in(handle: int, folder: Path, below: str = "", depth: int = 1) -> list
             names.append(name)
         else:
             raise BundleError(f"{folder}: {name} must be a plain file, got a device or pipe: {_AGAIN}")
-        if len(names) > MOST_FILES + 2:
+        if len(names) > MOST_FILES + 2 + len(BESIDE):
             raise BundleError(f"{folder} must hold at most {MOST_FILES} files, got more: is it a bundle's folder?")
     return names
 

@@ -13,7 +13,7 @@ from rich.progress import track
 
 from attentionvote.data.datamodule import PartDataModule
 from attentionvote.evaluation import PoseMetric, SceneResult, average_precision, curves, evaluate_at
-from attentionvote.evaluation.scores import THRESHOLDS
+from attentionvote.evaluation.scores import HEADLINES, THRESHOLDS
 from attentionvote.training.checkpoint import load_weights, save_trained
 from attentionvote.training.losses import AttentionVoteLoss
 from attentionvote.training.module import PoseTraining
@@ -23,10 +23,6 @@ from attentionvote.training.processes import in_order
 from attentionvote.training.proposal_counts import ProposalCounts, proposal_figures
 
 log = logging.getLogger("attentionvote.train")
-# Figures of the test that are metrics of the run, to plot and compare; all of them are rows of a table.
-HEADLINES = (
-    "ap_10", "ap_5", "ap_2", "precision_10", "recall_10", "proposal_recall", "center_error_mm", "rotation_error_deg",
-)  # fmt: skip
 FIGURES = "test/figures.json"
 _LEAST_HISTORY = 10  # logged steps from which on it can be said whether a loss fell
 

@@ -11,6 +11,7 @@ from typing import Any
 from attentionvote.command.configuration import leaves
 from attentionvote.command.identity import identifies
 from attentionvote.command.words import parse
+from attentionvote.evaluation.scores import HEADLINES
 from attentionvote.files import write_json
 from attentionvote.simulation.scene_spec import scene_set_directory
 from attentionvote.tracking.datasets import RunDataset
@@ -18,7 +19,7 @@ from attentionvote.tracking.run import Run
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.training.module import PoseTraining
 from attentionvote.workflows.train.job import RUN, TrainingJob
-from attentionvote.workflows.train.results import FIGURES, HEADLINES
+from attentionvote.workflows.train.results import FIGURES
 from attentionvote.workflows.train.settings import TrainSettings
 
 log = logging.getLogger("attentionvote.train")
@@ -102,7 +103,7 @@ def preset(cfg: TrainSettings) -> str:
 
 
 def run_name(cfg: TrainSettings, job: TrainingJob) -> str:
-    """A name that tells runs apart in a table: part, preset, seed, epochs, the first digits of the training's digest."""
+    """A name that tells runs apart in a table: part, preset, seed, epochs, the beginning of the digest."""
     return f"{job.part.name} {preset(cfg)} s{cfg.seed} {cfg.trainer.max_epochs}e {job.directory.name[:6]}"
 
 
