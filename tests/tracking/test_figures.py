@@ -152,13 +152,3 @@ def test_smoothed_is_the_mean_of_the_last_finite_values():
     expected = [np.nanmean(values[max(0, end - 2) : end]) for end in range(1, 5)]
     np.testing.assert_allclose(figures.smoothed(values, 2), expected)
     assert np.isnan(figures.smoothed([np.nan, 2.0], 1)[0])
-
-
-def test_importance_and_trials_of_a_sweep_are_drawn():
-    image = _pixels(figures.importance_figure({"trainer.learning_rate": 0.7, "loss.weights.vote": 0.3}))
-    assert _count(image, figures.PALETTE[0]) > 10000  # the bars
-    with pytest.raises(ValueError, match="at least one setting, got none"):
-        figures.importance_figure({})
-    image = _pixels(figures.trials_figure({"complete": ([0, 2], [0.2, 0.6]), "pruned": ([1], [float("nan")])}))
-    assert _count(image, figures.PALETTE[0]) > 1000
-    assert _pixels(figures.trials_figure({"complete": ([], [])})).shape[1] == 1600

@@ -15,7 +15,7 @@ import pytest
 
 from attentionvote.contract import VERSION, ModelCard
 from attentionvote.inference.bundles.bundle import load_bundle
-from attentionvote.inference.bundles.manifest import write_manifest
+from attentionvote.inference.bundles.manifest import BESIDE, write_manifest
 from attentionvote.inference.bundles.signature import load_private_key, load_public_key, make_keys
 from attentionvote.inference.errors import BundleError
 
@@ -118,6 +118,20 @@ def test_an_unlisted_file_is_named(bundle_folder: Path, trusted_key: Path, name:
     path.parent.mkdir(exist_ok=True)
     path.write_text("x")
     with pytest.raises(BundleError, match=rf"{name} is not in manifest.json: remove it, or export the bundle again"):
+        load_bundle(bundle_folder, trusted_key)
+
+
+def test_what_mlflow_keeps_beside_the_files_is_passed_over_by_its_names_alone(
+    bundle_folder: Path, trusted_key: Path, signing_keys: tuple[Path, Path]
+) -> None:
+    digest = load_bundle(bundle_folder, trusted_key).digest
+    for name in BESIDE:
+        (bundle_folder / name).write_text("not read")
+    assert load_bundle(bundle_folder, trusted_key).digest == digest
+    write_manifest(bundle_folder, load_private_key(signing_keys[0]))
+    assert load_bundle(bundle_folder, trusted_key).digest == digest
+    (bundle_folder / "golden" / "MLmodel").write_text("x")
+    with pytest.raises(BundleError, match=r"golden/MLmodel is not in manifest\.json"):
         load_bundle(bundle_folder, trusted_key)
 
 

@@ -119,7 +119,7 @@ def test_killed_continued_pruned_reported_and_trained_with(words: list[str], tmp
         "0": ("complete", "FINISHED"), "5": ("pruned", "KILLED"),
     }  # fmt: skip
     kept = {item.path for item in client.list_artifacts(parent.info.run_id)}
-    assert {"importance.png", "trials.png", "trials.csv", "trials.json", "best.yaml", "config.yaml"} <= kept
+    assert {"trials.html", "trials.csv", "trials.json", "best.yaml", "config.yaml"} <= kept
     assert set(result["importance"]) == {setting.name for setting in job.space}
     with (job.folder / "trials.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -160,7 +160,7 @@ def test_a_study_that_has_its_total_is_reported_without_a_worker(words: list[str
     result = run([*words, "trials=4", "executor=ray", "cluster.address=203.0.113.1:6379"])  # where there is no cluster
     assert result["states"] == {"complete": 4}
     assert result["best"]["trial"] == 3
-    assert {"trials.png", "best.yaml", "trials.csv"} <= {path.name for path in job.folder.iterdir()}
+    assert {"trials.html", "best.yaml", "trials.csv"} <= {path.name for path in job.folder.iterdir()}
     assert (tmp_path / "sweep" / "brick" / "best.yaml").read_text() == (job.folder / "best.yaml").read_text()
 
 

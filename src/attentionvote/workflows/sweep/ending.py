@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from attentionvote.command.conf_folder import new_file
 from attentionvote.files import write_whole
+from attentionvote.workflows.sweep.figures import figures_page
 from attentionvote.workflows.sweep.report import experiment_text, importances, run_of, write_table
 from attentionvote.workflows.sweep.study import Ledger
 
@@ -36,8 +37,6 @@ def report(
     Raises:
         ValueError: when no trial is complete, with the reason of the last that failed.
     """
-    from attentionvote.drawing.figures import importance_figure, trials_figure
-
     best, study = ledger.best, ledger.study.study_name
     for path in write_table(ledger, folder):
         parent.log_file(path.name, path)
@@ -58,21 +57,10 @@ def report(
         )
     complete = [trial for trial in ledger.trials if trial.state == TrialState.COMPLETE]
     shares = importances(ledger)
-    figures = {
-        "trials.png": trials_figure(
-            {
-                state.name.lower(): _scores([trial for trial in ledger.trials if trial.state == state])
-                for state in (TrialState.COMPLETE, TrialState.PRUNED)
-            }
-        )
-    }
-    if shares:
-        figures["importance.png"] = importance_figure(shares)
-    else:
+    if not shares:
         log.info("what matters most cannot be told from %d complete trials", len(complete))
-    for name, figure in figures.items():
-        figure.savefig(folder / name)
-        parent.log_file(name, folder / name)
+    write_whole(folder / "trials.html", figures_page(ledger.study, bool(shares)))
+    parent.log_file("trials.html", folder / "trials.html")
     values = {s.name: s.value(best.params[s.name]) for s in ledger.space}
     title = f"Trial {best.number} of the sweep {study}: val/ap {best.value:.4f}, best of {len(complete)}."
     text = experiment_text(base, values, title)
@@ -96,9 +84,3 @@ def report(
         "folder": str(folder),
         "failed": failed,
     }
-
-
-def _scores(trials: Sequence[FrozenTrial]) -> tuple[list[int], list[float]]:
-    """Numbers and values of trials; of a pruned one the last value that it reported."""
-    values = [trial.value if trial.value is not None else float("nan") for trial in trials]
-    return [trial.number for trial in trials], values
