@@ -14,6 +14,7 @@ from real_disks import resize, small_disk
 from attentionvote.files import DiskFull
 from attentionvote.tracking.run_opening import start_run
 from attentionvote.tracking.server import free_port
+from attentionvote.tracking.sqlite_file import sqlite_file
 from attentionvote.tracking.store import (
     artifact_root,
     connect,
@@ -22,7 +23,6 @@ from attentionvote.tracking.store import (
     has_password,
     resolve_store,
     shown,
-    sqlite_file,
 )
 
 
@@ -63,7 +63,7 @@ def test_resolve_store_rejects_with_the_nearest_choice(store, sentence):
         resolve_store(store)
 
 
-@pytest.mark.parametrize("name", ["x%20y", "a?b", "c#d", "100%", "é ;'@ 日本"])
+@pytest.mark.parametrize("name", ["x%20y", "a?b #c 100%", "é ;'@ 日本"])
 def test_a_store_lies_in_its_folder_whatever_that_is_called(name, tmp_path, monkeypatch):
     folder = tmp_path / name
     folder.mkdir()

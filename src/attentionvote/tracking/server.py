@@ -15,14 +15,8 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from attentionvote.tracking.store import (
-    artifact_root,
-    connect,
-    is_server,
-    quiet_environment,
-    resolve_store,
-    without_stray_folder,
-)
+from attentionvote.tracking.sqlite_file import without_stray_folder
+from attentionvote.tracking.store import artifact_root, connect, is_server, quiet_environment, resolve_store
 
 # Run before the server's own program, in its process: the kernel ends it when whoever started it is gone, however that
 # ended; MLflow hands the signal on to its child. 1 is PR_SET_PDEATHSIG, which outlives exec.

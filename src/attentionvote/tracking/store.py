@@ -13,8 +13,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from attentionvote.files import DiskFull, disk_full, remove_leftovers, waiting_lock, whole
+from attentionvote.files import DiskFull, waiting_lock
 from attentionvote.tracking.server_check import CREDENTIALS, check_access, check_health, check_version
+from attentionvote.tracking.sqlite_file import (
+    check_encoding,
+    create_database,
+    naming_full_disk,
+    sqlite_file,
+    sqlite_uri,
+    without_stray_folder,
+)
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -52,14 +60,14 @@ def resolve_store(store: str | None) -> str:
     """
     store = store or os.environ.get("MLFLOW_TRACKING_URI") or "outputs/mlflow.db"
     if "://" not in store and not store.startswith(("file:", "sqlite:")) and store.endswith(".db"):
-        return _sqlite_uri(Path(store))
+        return sqlite_uri(Path(store))
     scheme = store.split(":", 1)[0].split("+", 1)[0] if ":" in store else ""
     if scheme == "sqlite":
         path = re.sub(r"^sqlite(\+\w+)?:///", "", store)
         if path == store or not path:
             raise ValueError(f"an SQLite tracking store must read sqlite:///PATH.db, got {store!r}")
-        _check_encoding(store, path)
-        return _sqlite_uri(Path(urllib.parse.unquote(path)))
+        check_encoding(store, path)
+        return sqlite_uri(Path(urllib.parse.unquote(path)))
     if scheme in SERVERS:
         if "@" in store.split("://", 1)[-1].partition("/")[0]:
             raise ValueError(
@@ -83,40 +91,6 @@ def resolve_store(store: str | None) -> str:
     raise ValueError(
         f"tracking store must start with one of {', '.join(choices)}, got {shown(store)!r}, nearest: '{near}://'"
     )
-
-
-def _sqlite_uri(path: Path) -> str:
-    text = os.fspath(path.expanduser().absolute())
-    for letter in "%?#":  # first the % of the others
-        text = text.replace(letter, f"%{ord(letter):02X}")
-    return f"sqlite:///{text}"
-
-
-def _check_encoding(store: str, path: str) -> None:
-    """Refuse a path that is there as it stands: SQLAlchemy would write into another file, without a word."""
-    literal = Path(path).expanduser()
-    if "?" in path or (urllib.parse.unquote(path) != path and literal.parent.is_dir()):
-        raise ValueError(
-            f"the path in an SQLite tracking store's address must be percent-encoded (% is %25, ? is %3F), got "
-            f"{store!r}, nearest: {_sqlite_uri(literal)!r}"
-        )
-
-
-def sqlite_file(uri: str) -> Path | None:
-    """The file of a resolved store, None for another kind."""
-    path = uri.removeprefix("sqlite:///")
-    return None if path == uri else Path(urllib.parse.unquote(path))
-
-
-@contextlib.contextmanager
-def without_stray_folder(uri: str) -> Iterator[None]:
-    """Remove the empty folder that MLflow makes for an SQLite file whose address is percent-encoded."""
-    stray = Path(uri.removeprefix("sqlite:///")).parent
-    is_ours = sqlite_file(uri) is not None and "%" in os.fspath(stray) and not stray.exists()
-    yield
-    if is_ours:
-        with contextlib.suppress(OSError):
-            os.removedirs(stray)
 
 
 def shown(store: str) -> str:
@@ -196,9 +170,9 @@ def connect(uri: str) -> MlflowClient:
     for name in ("urllib3.connectionpool", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
     try:
-        with exclusive(uri), without_stray_folder(uri), warnings.catch_warnings(), _naming_full_disk(uri):
+        with exclusive(uri), without_stray_folder(uri), warnings.catch_warnings(), naming_full_disk(uri):
             warnings.simplefilter("ignore")  # MLflow's tables use what SQLAlchemy deprecates
-            _create_database(uri)
+            create_database(uri)
             client = MlflowClient(uri, registry_uri=uri)
     except MlflowException as error:
         sentence = str(error).strip().splitlines()[0]
@@ -215,39 +189,6 @@ def connect(uri: str) -> MlflowClient:
     return client
 
 
-@contextlib.contextmanager
-def _naming_full_disk(uri: str) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:  # of SQLAlchemy or MLflow, around SQLite's
-        file = sqlite_file(uri)
-        full = None if file is None else disk_full(error, file.parent)
-        if full is None:
-            raise
-        raise full from error
-
-
-def _create_database(uri: str) -> None:
-    """Make a new SQLite file whole or not at all: half of MLflow's tables, of a full disk or a kill, open no more."""
-    path = sqlite_file(uri)
-    if path is not None and not path.exists():
-        for name in (path.name, f"{path.name}-journal"):
-            remove_leftovers(path.with_name(name))
-        whole(path, _make_tables)
-
-
-def _make_tables(path: Path) -> None:
-    from mlflow.store.db.utils import _initialize_tables
-    from sqlalchemy import URL, create_engine
-    from sqlalchemy.pool import NullPool
-
-    engine = create_engine(URL.create("sqlite", database=str(path)), poolclass=NullPool)
-    try:
-        _initialize_tables(engine)
-    finally:
-        engine.dispose()
-
-
 def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
     """Id of the experiment, created when new and restored when it had been deleted in the UI.
 
@@ -257,7 +198,7 @@ def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
     from mlflow.exceptions import MlflowException
 
     try:
-        with exclusive(uri), _naming_full_disk(uri):
+        with exclusive(uri), naming_full_disk(uri):
             return _ensured_experiment(client, uri, name)
     except MlflowException as error:
         if error.get_http_status_code() != 403:

@@ -90,6 +90,7 @@ def parameters(cfg: TrainSettings, job: TrainingJob, weights: int) -> dict[str, 
         "epochs": cfg.trainer.max_epochs,
         "batch_size": cfg.trainer.batch_size,
         "learning_rate": cfg.trainer.learning_rate,
+        "precision": job.precision,
         "model.classes": len(job.part.parts),
     }
     return {**settings, **glance} | ({} if job.dataset is None else {"dataset": str(job.dataset)})
