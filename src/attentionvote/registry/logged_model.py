@@ -56,7 +56,7 @@ def log_model(
     from mlflow.entities import LoggedModelOutput
 
     _fail_unfinished(client, experiment)
-    run_id = run.info.run_id if run else None
+    run_id: str | None = run.info.run_id if run else None
     model = client.create_logged_model(
         experiment,
         name=f"{bundle.card.part.name}-{bundle.digest[:12]}",
@@ -70,7 +70,7 @@ def log_model(
             write_flavours(Path(folder), bundle, model.model_id, run_id)
             client.log_model_artifacts(model.model_id, folder)
         check(model.artifact_location)
-        if run:
+        if run_id is not None:
             client.log_model_params(model.model_id, dict(run.data.params))
             client.log_outputs(run_id, [LoggedModelOutput(model.model_id, step=0)])
             _log_figures(client, run_id, model.model_id, figures)

@@ -113,7 +113,8 @@ class PoseTraining(L.LightningModule):
         mixed = isinstance(precision, MixedPrecision) and getattr(optimizer, "_step_supports_amp_scaling", False)
         if most and mixed:  # Lightning refuses it, in words of its own
             self.clip_gradients(optimizer, most, gradient_clip_algorithm)
-        if most or (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # a norm for nothing costs time
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning declares it nowhere
+        if most or (self.global_step + 1) % every == 0:  # a norm for nothing costs time
             self.log("train/gradient_norm", clip_gradient(precision.main_params(optimizer), most))
 
     def on_validation_epoch_start(self) -> None:
