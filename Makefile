@@ -157,8 +157,7 @@ ui: $(STAMP) ## Open the tracked runs in a browser (MLflow)
 	@$(PY) pipelines/ui.py $(ARGS)
 
 test: $(STAMP) ## Run every test
-	@# Three on two cores: one of them mostly waits, for a server or a child.
-	@$(PY) -m pytest -n 3 --dist loadfile $(PYTEST_ARGS)
+	@$(PY) -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 test-fast: $(STAMP) ## Run the tests that take seconds
 	@$(PY) -m pytest -m "not slow" $(PYTEST_ARGS)

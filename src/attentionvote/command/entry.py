@@ -32,7 +32,7 @@ from attentionvote.command.configuration import Settings, compose
 from attentionvote.command.errors import ConfigurationError, Refused, sentence
 from attentionvote.command.grid import run_grid
 from attentionvote.command.help import help_text
-from attentionvote.command.interruption import catch_sigterm, interruption
+from attentionvote.command.interruption import catch_sigterm, ignore_sigterm, interruption
 from attentionvote.execution.job_process import join_starter, report_failure
 from attentionvote.files import FolderUnavailable
 
@@ -168,11 +168,12 @@ def _reporting_errors(verb: str) -> Iterator[None]:
     """Every exception becomes one sentence on stderr and an exit code."""
     try:
         yield
-    except (ConfigurationError, FolderUnavailable) as error:
-        _leave(f"{verb}: {sentence(error)}", 2)
-    except Refused as error:
-        _leave(f"{verb}: {sentence(error)}", 1)
     except BaseException as error:
+        ignore_sigterm()
+        if isinstance(error, (ConfigurationError, FolderUnavailable)):
+            _leave(f"{verb}: {sentence(error)}", 2)
+        if isinstance(error, Refused):
+            _leave(f"{verb}: {sentence(error)}", 1)
         code = interruption(error)
         if code is not None:
             _leave(f"{verb}: interrupted; run the same command to resume", code)

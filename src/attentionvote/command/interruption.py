@@ -18,6 +18,11 @@ def catch_sigterm() -> None:
         signal.signal(signal.SIGTERM, _terminate)
 
 
+def ignore_sigterm() -> None:
+    """From now on SIGTERM changes nothing: this process is at its end, and says why."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
 def interruption(error: BaseException) -> int | None:
     """The exit code of a verb that this exception ends; None when it was no interruption.
 
@@ -32,6 +37,6 @@ def interruption(error: BaseException) -> int | None:
     return TERMINATED if isinstance(cause, Terminated) else INTERRUPTED
 
 
-def _terminate(number: int, _: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)  # managers repeat it; what is stuck they end by SIGKILL
+def _terminate(_: int, __: FrameType | None) -> None:
+    ignore_sigterm()  # managers repeat it; what is stuck they end by SIGKILL
     raise Terminated
