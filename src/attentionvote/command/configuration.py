@@ -146,7 +146,7 @@ def _compose(name: str, overrides: Sequence[str], conf: Path) -> DictConfig:
             return hydra_compose(name, [*search, *overrides])
     except MissingConfigException as error:
         group, _, name = (error.missing_cfg_file or "").rpartition("/")
-        if group and (conf / group).is_dir():
+        if group and is_group(group, conf):
             raise ConfigurationError(_choice_problem(group, name, conf)) from error
         raise ConfigurationError(sentence(error).split(" Config search path")[0]) from error
     except ConfigCompositionException as error:
