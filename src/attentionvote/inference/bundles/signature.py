@@ -63,8 +63,10 @@ def make_keys(folder: Path) -> tuple[Path, Path]:
     try:
         if not folder.is_dir():
             folder.mkdir(parents=True, mode=0o700)
-        key = load_private_key(private) if private.exists() else Ed25519PrivateKey.generate()
-        if not private.exists():
+        if private.exists():
+            key = load_private_key(private)
+        else:
+            key = Ed25519PrivateKey.generate()
             pem = key.private_bytes(
                 serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
             )
