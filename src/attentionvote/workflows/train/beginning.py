@@ -36,13 +36,18 @@ def origin(init: str, store: str | None) -> dict[str, str]:
     return {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
-def checkpoint_of(init: str, store: str | None, folder: Path) -> Path:
+def checkpoint_of(init: str, run_id: str | None, store: str | None, folder: Path) -> Path:
     """The file that ``init`` means, fetched into a folder where it is a run's.
+
+    Args:
+        init: see the setting.
+        run_id: that ``origin`` said; None where it is a file.
+        store: of the runs.
+        folder: for what is fetched.
 
     Raises:
         ValueError: the store does not have it.
     """
-    run_id = origin(init, store).get("run")
     if run_id is None:
         return _file(init)
     from mlflow.exceptions import MlflowException

@@ -39,7 +39,7 @@ class TrainingJob:
         part: what it looks for, or a set of parts.
         specs: of the scene sets it needs, by split; empty with a dataset.
         dataset: whose scenes it takes instead.
-        shorter: folder of the same training with fewer epochs, which it goes on from.
+        init_run: the run whose weights it begins with, where ``init`` means one.
         precision: of its arithmetic, resolved.
     """
 
@@ -47,7 +47,7 @@ class TrainingJob:
     part: Parts
     specs: dict[str, SceneSetSpec]
     dataset: DatasetSplits | None = None
-    shorter: Path | None = None
+    init_run: str | None = None
     precision: str = CPU_PRECISION
 
     @property
@@ -111,13 +111,16 @@ def find_training(cfg: TrainSettings, gpu: bool | None = None) -> TrainingJob:
     )
     # A training of an earlier version is found where that put it.
     directory = folder if folder.exists() or not folder_once.exists() else folder_once
-    return replace(job, directory=directory, shorter=_shorter(cfg, job, directory))
+    return replace(job, directory=directory, init_run=begins_with.get("init", {}).get("run"))
 
 
-def _shorter(cfg: TrainSettings, job: TrainingJob, directory: Path) -> Path | None:
-    """The complete training that is this one but for its fewer epochs, the longest; None where there is none."""
-    begun = (directory / "checkpoints").exists()
-    trained = {file.parent.name for file in job.directory.glob(f"*/{RESULT}")}
+def shorter_training(cfg: TrainSettings, job: TrainingJob) -> Path | None:
+    """Folder of the complete training that is this one but for its fewer epochs, the longest; None where none is.
+
+    Also None where this one has begun already, or begins with other weights.
+    """
+    begun = (job.directory / "checkpoints").exists()
+    trained = {file.parent.name for file in job.directory.parent.glob(f"*/{RESULT}")}
     if begun or not trained or cfg.init is not None or cfg.trainer.max_steps is not None:
         return None
     for once in (False, True):
@@ -125,7 +128,7 @@ def _shorter(cfg: TrainSettings, job: TrainingJob, directory: Path) -> Path | No
         for epochs in range(cfg.trainer.max_epochs - 1, max(0, cfg.trainer.max_epochs - _MOST_EPOCHS), -1):
             plain["trainer"]["max_epochs"] = epochs
             if (name := _digest(deepcopy(plain), job)) in trained:
-                return job.directory / name
+                return job.directory.with_name(name)
     return None
 
 

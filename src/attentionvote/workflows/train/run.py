@@ -23,7 +23,7 @@ from attentionvote.training.pictures import ScenePictures
 from attentionvote.training.progress import TrainingProgress
 from attentionvote.workflows.train.beginning import checkpoint_of, take_over, take_weights
 from attentionvote.workflows.train.data import prepare_data
-from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob
+from attentionvote.workflows.train.job import MODEL, RESULT, TrainingJob, shorter_training
 from attentionvote.workflows.train.pieces import cloud_settings, data_module, pose_training
 from attentionvote.workflows.train.precision import check_precision, device_type
 from attentionvote.workflows.train.processes import FirstDoes, TrainingProcess
@@ -157,7 +157,8 @@ class TrainingRun:
         start = self.first_does("checkpoint", lambda: self._begin(files, shapes))
         if not start and self.cfg.init is not None:
             store, folder = self.cfg.tracking.store, self.job.directory / "init"
-            path = self.first_does("init", lambda: str(checkpoint_of(str(self.cfg.init), store, folder)))
+            init, run_id = self.cfg.init, self.job.init_run
+            path = self.first_does("init", lambda: str(checkpoint_of(init, run_id, store, folder)))
             take_weights(self.module.model, Path(path), self.cfg.init)
         trainer.fit(self.module, data, ckpt_path=start or None, weights_only=True)
         if trainer.interrupted:
@@ -168,13 +169,15 @@ class TrainingRun:
         """The checkpoint to go on from, empty at the beginning; of a shorter training where there is one."""
         if self.cfg.trainer.dev_batches:
             return ""
-        if self.job.shorter is not None and self.cfg.resume != "never" and not self.cfg.force:
+        anew = self.cfg.resume == "never" or self.cfg.force
+        shorter = None if anew else shorter_training(self.cfg, self.job)
+        if shorter is not None:
             if self.cfg.goes_on_exactly:
-                take_over(self.job.shorter, self.job.directory)
+                take_over(shorter, self.job.directory)
             else:
                 log.info(
                     "trained anew, because the learning rate and callbacks of %s went by its own number of epochs; "
-                    "init=%s would begin with its weights", self.job.shorter, self.job.shorter,
+                    "init=%s would begin with its weights", shorter, shorter,
                 )  # fmt: skip
         return str(usable_checkpoint(files, shapes) or "")
 
