@@ -93,7 +93,7 @@ smoke: $(STAMP) ## The whole chain on tiny settings, at most 3 minutes on 2 core
 	@$(PY) pipelines/train.py object=$(smoke_object) experiment=smoke $(ARGS)
 	@$(PY) pipelines/export.py object=$(smoke_object) trained=outputs/smoke/train root=outputs/smoke/data \
 		outputs=outputs/smoke/export signing_keys=outputs/smoke/keys scenes=3 limits.scenes=3 golden=1
-	@$(PY) pipelines/promote.py object=$(smoke_object) simulation=smoke evaluation.cycles=1 root=outputs/smoke/data \
+	@$(PY) pipelines/promote.py object=$(smoke_object) simulation=smoke evaluation.cycles=3 root=outputs/smoke/data \
 		bundles=outputs/smoke/export trusted_key=outputs/smoke/keys/signing.pub tracking.store=outputs/smoke/mlflow.db \
 		"gates={scenes:3,floors:{ap_10:0,precision_10:0,recall_10:0},parity:{scenes:3},provenance:[data,signature]}"
 	@$(VENV)/bin/attentionvote verify-bundle outputs/smoke/export/$(smoke_object)/latest \

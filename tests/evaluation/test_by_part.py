@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from attentionvote.evaluation import PoseMetric, SceneResult, evaluate, evaluate_at, resampled_figures, scene_weights
+from attentionvote.evaluation import PoseMetric, SceneResult, evaluate, evaluate_at, left_out_figures
 from attentionvote.evaluation.by_part import COUNTS, by_part
 from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part, PartSet
@@ -70,13 +70,16 @@ def test_precision_is_of_the_detections_for_every_part(box_and_slab: PartSet, sc
         assert at[name] == kept[name]
 
 
-def test_the_bootstrap_draws_the_same_scenes_for_every_part(box_and_slab: PartSet, scenes: list[SceneResult]) -> None:
-    draws = resampled_figures(scenes, box_and_slab, 0.2, np.ones((1, len(scenes))))
-    figures = evaluate_at(scenes, box_and_slab, 0.2, add=False)
+def test_the_same_cycles_are_left_out_of_every_part(box_and_slab: PartSet, scenes: list[SceneResult]) -> None:
+    cycles = np.array([0, 0, 1, 2])
+    figures = left_out_figures(scenes, cycles, box_and_slab, 0.2)
     for name in ("ap_10", "box/ap_5", "slab/recall_10", "recall_10"):
-        assert draws[name][0] == pytest.approx(figures[name]), name
-    several = resampled_figures(scenes, box_and_slab, 0.2, scene_weights(len(scenes), 20))
-    np.testing.assert_allclose(several["ap_10"], (several["box/ap_10"] + several["slab/ap_10"]) / 2)
+        assert figures[name].value == pytest.approx(evaluate_at(scenes, box_and_slab, 0.2, add=False)[name]), name
+        for cycle, without in enumerate(figures[name].without):
+            left = [scene for scene, c in zip(scenes, cycles, strict=True) if c != cycle]
+            assert without == pytest.approx(evaluate_at(left, box_and_slab, 0.2, add=False)[name]), name
+    part_values = [figures[f"{part.name}/ap_10"].without for part in box_and_slab.parts]
+    np.testing.assert_allclose(figures["ap_10"].without, np.mean(part_values, axis=0))
 
 
 def test_what_cannot_be_measured_on_a_part_is_left_out_of_the_mean(box_and_slab: PartSet) -> None:

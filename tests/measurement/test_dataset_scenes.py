@@ -42,6 +42,7 @@ def brick() -> Any:
 def test_scored_scenes_come_without_background_and_thinned(ipa: Path, brick: Any) -> None:
     scenes = DatasetScenes.find(ipa, brick, 1000)
     assert len(scenes) == 1  # fewer than five drops are not scored
+    assert list(scenes.cycle_of_scene) == [0]
     (cloud,), (again,) = list(scenes.clouds()), list(scenes.clouds())
     assert len(cloud.points) == 1000
     assert (cloud.instance_ids >= 0).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from attentionvote.data.sensing import CloudSettings, sense
-from attentionvote.evaluation import evaluate, interval
+from attentionvote.evaluation import evaluate, left_out_figures
 from attentionvote.inference import PoseEstimator, load_bundle
 from attentionvote.measurement.models import measure
 from attentionvote.measurement.scenes import EvaluationSet
@@ -72,10 +72,14 @@ def test_figures_are_of_the_results_and_the_clock(frozen, make_box_model):
     )
     assert 0 < figures["latency_p50_ms"] <= figures["latency_p95_ms"] < 5000
     assert measured.seconds.shape == (3,)
-    draws = measured.resampled(part, draws=50)
-    assert all(values.shape == (50,) for values in draws.values())
-    sure = interval(draws["ap_10"])
-    assert sure.low <= figures["ap_10"] <= sure.high
+    np.testing.assert_array_equal(measured.cycles, frozen.cycle_of_scene)
+    left_out = measured.left_out(part)
+    assert {name: figure.value for name, figure in left_out.items()} == pytest.approx(
+        {name: figures[name] for name in left_out}
+    )
+    assert left_out["ap_10"].without.shape == (3,)
+    expected = left_out_figures(measured.results, np.arange(3), part, 0.5)["ap_10"].without
+    np.testing.assert_array_equal(left_out["ap_10"].without, expected)
 
 
 def test_a_scene_without_points_is_a_scene_without_results(make_scenes, box, make_box_model):

@@ -24,8 +24,9 @@ from attentionvote.part import Part
 from attentionvote.simulation import cycle, cycle_pool, scene_set
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop_settings import DropSettings
+from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
-from attentionvote.simulation.scene_set import SceneSet, content_digest, generate_scene_set
+from attentionvote.simulation.scene_set import SceneSet, content_digest, find_record, generate_scene_set
 from attentionvote.simulation.scene_spec import SceneSetSpec
 
 COARSE = DropSettings(timestep=0.008, contact_time=0.02)
@@ -62,6 +63,31 @@ def test_a_set_holds_what_its_specification_says(bracket: Part, tmp_path: Path) 
     assert len({r.friction for r in scenes}) == 4
     assert sorted(p.name for p in (tmp_path / "set").iterdir()) == [".lock", "cycles", "hulls.npz", "manifest.json"]
     assert len(list((tmp_path / "set" / "cycles").iterdir())) == 4
+
+
+def test_what_a_thinned_set_keeps_is_as_in_the_full_one(bracket: Part, tmp_path: Path) -> None:
+    full = make_spec(bracket, drop_counts=(1, 2, 3, 4))
+    thin = replace(full, keep_every=3)
+    everything = {
+        (r.cycle, r.drop_count): r for r in generate_scene_set(bracket, full, tmp_path / "full", progress=False)
+    }
+    scenes = generate_scene_set(bracket, thin, tmp_path / "thin", progress=False)
+    places = [(0, 1), (0, 4), (1, 2), (2, 3), (3, 1), (3, 4)]
+    assert [(r.cycle, r.drop_count) for r in scenes] == places
+    assert (len(scenes), list(scenes.cycle_of_scene)) == (thin.scenes, [0, 0, 1, 2, 3, 3])
+    for r in scenes:
+        same = everything[r.cycle, r.drop_count]
+        np.testing.assert_array_equal(r.camera_from_part, same.camera_from_part)
+        np.testing.assert_array_equal(r.camera_from_bin, same.camera_from_bin)
+        np.testing.assert_array_equal(r.bin_size, same.bin_size)
+        assert r.scene_seed == same.scene_seed
+    caster = PartCaster(bracket)
+    for number, place in enumerate(places):
+        r = find_record(bracket, caster, thin, tmp_path / "not generated", number)
+        assert (r.cycle, r.drop_count) == place
+        np.testing.assert_allclose(r.camera_from_part, everything[place].camera_from_part, atol=1e-12)
+    with pytest.raises(ValueError, match="scene must be below 6 in split train; got 6"):
+        find_record(bracket, caster, thin, tmp_path / "not generated", 6)
 
 
 def test_two_workers_give_the_same_bits_as_one(

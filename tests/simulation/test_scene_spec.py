@@ -27,6 +27,7 @@ OTHERS = {
     "drop": DropSettings(timestep=0.005),
     "visibility_stride": 3,
     "format_version": 2,
+    "keep_every": 2,
 }
 
 
@@ -41,6 +42,22 @@ def test_the_digest_does_not_depend_on_how_the_values_were_written() -> None:
     listed = replace(SPEC, drop_counts=list(SPEC.drop_counts), drop=DropSettings(friction=[0.2, 0.6]))  # type: ignore[arg-type]
     assert listed.digest() == SPEC.digest()
     assert json.loads(json.dumps(SPEC.as_dict())) == SPEC.as_dict()
+
+
+def test_a_set_that_keeps_all_has_the_digest_of_before_it_could_keep_less() -> None:
+    assert SPEC.digest() == "50102b90a47fad025f336c451a6ea8689085edcc65b97c97175dc6cb83442d1b"  # of commit 83d427a
+
+
+def test_cycles_in_turn_keep_all_counts_between_them() -> None:
+    counts = SPEC.drop_counts
+    thin = replace(SPEC, keep_every=3)
+    assert [thin.counts_of(cycle) for cycle in (0, 1, 2)] == [counts[0::3], counts[1::3], counts[2::3]]
+    assert thin.counts_of(7) == thin.counts_of(1)
+    assert thin.scenes == 3 * len(counts) + 5  # cycles 0 to 8, and cycle 9 as cycle 0
+    assert sorted(thin.counts_of(0) + thin.counts_of(1) + thin.counts_of(2)) == list(counts)
+    few = replace(SPEC, drop_counts=(2, 5), keep_every=3)
+    assert [few.counts_of(cycle) for cycle in (0, 1, 2)] == [(2,), (5,), (2,)]  # at least one
+    assert (SPEC.counts_of(4), SPEC.scenes) == (counts, 130)
 
 
 def test_cycles_of_all_splits_have_their_own_seeds() -> None:
@@ -69,13 +86,14 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
         "camera": {"camera": {"width": 640, "height": 480}, "distance": 0.5},
         "drop": {"friction": [0.3, 0.3]},
         "visibility_stride": 4,
+        "keep_every": {"test": 2},
     }
     specs = scene_set_specs(bracket, read(SimulationSettings, settings))
     assert specs["test"] == SceneSetSpec(
         bracket.digest, "test", 2, 3, (2, 4), BinSettings(None, 0.1), CameraSettings(Camera(640, 480), 0.5),
-        DropSettings(friction=(0.3, 0.3)), 4,
+        DropSettings(friction=(0.3, 0.3)), 4, keep_every=2,
     )  # fmt: skip
-    assert (specs["train"].cycles, set(specs)) == (5, {"train", "test"})
+    assert (specs["train"].cycles, specs["train"].keep_every, set(specs)) == (5, 1, {"train", "test"})
     assert settings["seed"] == 3
     assert settings["camera"]["camera"] == {"width": 640, "height": 480}  # type: ignore[index]
     with pytest.raises(SettingError, match=r"^there is no setting 'dorp', did you mean 'drop'"):
@@ -93,6 +111,7 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
         ({"drop_counts": (5, 5)}, "drop_counts must be increasing numbers within 1..200, got"),
         ({"drop_counts": (0, 5)}, "drop_counts must be increasing numbers within 1..200, got"),
         ({"visibility_stride": 9}, "visibility_stride must lie in 1..8, got 9"),
+        ({"keep_every": 0}, "keep_every must be at least 1, got 0"),
     ],
 )
 def test_impossible_specifications(change: dict, message: str) -> None:

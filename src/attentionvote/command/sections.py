@@ -93,7 +93,11 @@ class EvaluationSettings:
         str,
         Setting("Of the scenes: no training, validation or test has seen them.", choices=("evaluation", "benchmark")),
     ]
-    cycles: Annotated[int, Setting("Drop cycles, 13 scenes each.", low=1, high=10_000)]
+    cycles: Annotated[int, Setting("Drop cycles, the unit of the intervals.", low=1, high=10_000)]
+    keep_every: Annotated[
+        int,
+        Setting("A cycle keeps every so-many-th of drop_counts, each begins one later.", low=1, high=200),
+    ]
     sensor: Sensor
     density: Annotated[int, Setting("Most points of a cloud.", low=3, high=10_000_000)]
     threads: Annotated[int, Setting("Of an estimate, as the cell will have.", low=1, high=1024)]

@@ -43,6 +43,7 @@ class Clouds:
     def __init__(self, directory: Path, scenes: SceneSet | DatasetSplit) -> None:
         self.directory = directory
         self.records: Sequence[SceneRecord | GroundTruth] = scenes.records
+        self.cycle_of_scene = scenes.cycle_of_scene
         self._arrays = open_arrays(directory, "r")
 
     def __len__(self) -> int:

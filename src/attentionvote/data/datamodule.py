@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import lightning as L
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from attentionvote.data.augmentation import Augmentation
@@ -39,6 +40,13 @@ class CloudSamples(Dataset[Batch]):
         self.augmentation, self.seed = augmentation, seed
         count = clouds.count if isinstance(clouds, Clouds) else lambda i: len(clouds[i].points)
         self.scenes = [i for i in range(len(clouds)) if count(i) >= 3]
+
+    @property
+    def cycles(self) -> NDArray[np.int64]:
+        """``(S,)`` which drop cycle each scene is of; where nobody knows, each is its own."""
+        if not isinstance(self.clouds, Clouds):
+            return np.arange(len(self.scenes))
+        return self.clouds.cycle_of_scene[self.scenes]
 
     def __len__(self) -> int:
         return len(self.scenes)

@@ -93,6 +93,12 @@ class DatasetSplit:
             cycle.update(f"{len(content)} ".encode() + content)
         return {name: cycle.hexdigest() for name, cycle in hashes.items()}
 
+    @property
+    def cycle_of_scene(self) -> NDArray[np.int64]:
+        """``(S,)`` which drop cycle each scene is of, numbered in the order of their names."""
+        cycle_names = [self.dataset.cycle_of(name) for name in self.names]
+        return np.unique(cycle_names, return_inverse=True)[1]
+
     @cached_property
     def digest(self) -> str:
         """Sha256 of names, poses, visibility and cameras of all scenes; pictures are not read for it."""

@@ -4,7 +4,7 @@ Numpy and scipy only. Definitions follow the toolbox of Bregier et al. (2017).
 """
 
 from attentionvote.evaluation.average_precision import DetectionScores, average_precision
-from attentionvote.evaluation.bootstrap import Interval, interval, resampled_figures, scene_weights
+from attentionvote.evaluation.intervals import Interval, LeftOut, left_out_figures
 from attentionvote.evaluation.matching import match
 from attentionvote.evaluation.metric_file import read_metric
 from attentionvote.evaluation.pose_distance import PoseMetric, rotation_errors
@@ -15,6 +15,7 @@ from attentionvote.evaluation.scores import ap_by_threshold, curves, evaluate, e
 __all__ = [
     "DetectionScores",
     "Interval",
+    "LeftOut",
     "PoseMetric",
     "SceneResult",
     "ap_by_threshold",
@@ -22,11 +23,9 @@ __all__ = [
     "curves",
     "evaluate",
     "evaluate_at",
-    "interval",
+    "left_out_figures",
     "match",
     "read_metric",
     "read_scene_results",
-    "resampled_figures",
     "rotation_errors",
-    "scene_weights",
 ]

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from attentionvote.data.dataset_split import SHORT, DatasetSplit
 from attentionvote.data.part_frame import check_part_frame
@@ -68,6 +69,15 @@ class DatasetScenes:
         """Dataset and split."""
         return f"{self.dataset.title} {self.dataset.split}"
 
+    @property
+    def cycle_of_scene(self) -> NDArray[np.int64]:
+        """``(S,)`` which drop cycle each scene is of."""
+        return self._split.cycle_of_scene
+
+    @cached_property
+    def _split(self) -> DatasetSplit:
+        return DatasetSplit(self.dataset, self.dataset.scored_names, self.part)
+
     def __len__(self) -> int:
         return len(self.dataset.scored_names)
 
@@ -82,7 +92,7 @@ class DatasetScenes:
         """
         cycle_digests = trained_with.get("cycles", "")
         learned = {cycle_digests[i : i + SHORT] for i in range(0, len(cycle_digests), SHORT)}
-        cycles = DatasetSplit(self.dataset, self.dataset.scored_names, self.part).cycles
+        cycles = self._split.cycles
         seen = [name for name, digest in cycles.items() if digest[:SHORT] in learned]
         if self.dataset.written_from in trained_with.values():
             seen = list(cycles)

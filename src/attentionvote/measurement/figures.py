@@ -10,11 +10,11 @@ if TYPE_CHECKING:
 
 
 def figures_of(measured: Measurement, part: Parts) -> dict[str, Any]:
-    """``figures`` of ``Measurement.figures``; ``intervals``, ``[low, high]`` of 95 % of the draws; AP by threshold."""
-    from attentionvote.evaluation import ap_by_threshold, interval
+    """``figures`` of ``Measurement.figures``; ``intervals``, ``[low, high]``, none of one cycle; AP by threshold."""
+    from attentionvote.evaluation import ap_by_threshold
 
     thresholds, ap = ap_by_threshold(measured.results, part)
-    sure = {name: interval(draws) for name, draws in measured.resampled(part).items()}
+    sure = {name: figure.interval() for name, figure in measured.left_out(part).items()}
     return {
         "working_point": measured.working_point,
         "figures": {name: round(value, 6) for name, value in measured.figures(part).items()},

@@ -10,15 +10,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from attentionvote.evaluation import SceneResult, evaluate_at, resampled_figures, scene_weights
+from attentionvote.evaluation import LeftOut, SceneResult, evaluate_at, left_out_figures
 from attentionvote.evaluation.scene_result import Array
 from attentionvote.inference import Bundle, Estimate, PoseEstimator
 from attentionvote.measurement.scenes import MeasuredScenes
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
-
-DRAWS = 2000
 
 
 @dataclass(frozen=True)
@@ -28,12 +27,14 @@ class Measurement:
     Attributes:
         bundle: digest of the model's bundle.
         results: all proposals and the truth of every scene, in the set's order.
+        cycles: ``(S,)`` which drop cycle each scene is of.
         working_point: confidence from which on the model itself calls a proposal a detection.
         seconds: ``(S,)`` of one estimate each, preparation included.
     """
 
     bundle: str
     results: list[SceneResult] = field(repr=False)
+    cycles: NDArray[np.int64] = field(repr=False)
     working_point: float
     seconds: Array = field(repr=False)
 
@@ -43,9 +44,9 @@ class Measurement:
         figures = evaluate_at(self.results, part, self.working_point)
         return figures | {"latency_p50_ms": p50, "latency_p95_ms": p95}
 
-    def resampled(self, part: Parts, draws: int = DRAWS) -> dict[str, Array]:
-        """Figures of every bootstrap draw; those of two models on one set belong together draw by draw."""
-        return resampled_figures(self.results, part, self.working_point, scene_weights(len(self.results), draws))
+    def left_out(self, part: Parts) -> dict[str, LeftOut]:
+        """Figures with their intervals, see ``evaluation.left_out_figures``; none of a set of one drop cycle."""
+        return left_out_figures(self.results, self.cycles, part, self.working_point)
 
 
 def measure(
@@ -96,7 +97,7 @@ def measure(
     for estimator in estimators:
         estimator.close()
     return [
-        Measurement(bundle.digest, results, bundle.card.confidence_threshold, np.array(times))
+        Measurement(bundle.digest, results, scenes.cycle_of_scene, bundle.card.confidence_threshold, np.array(times))
         for bundle, results, times in zip(bundles, scene_results, seconds, strict=True)
     ]
 

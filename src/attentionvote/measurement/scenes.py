@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
@@ -34,6 +37,11 @@ class EvaluationSet:
     def title(self) -> str:
         """The sensor's preset."""
         return self.settings.sensor.preset
+
+    @property
+    def cycle_of_scene(self) -> NDArray[np.int64]:
+        """``(S,)`` which drop cycle each scene is of."""
+        return self.scenes.cycle_of_scene
 
     def __len__(self) -> int:
         return len(self.scenes)

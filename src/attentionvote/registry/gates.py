@@ -15,7 +15,7 @@ from attentionvote.section import check
 from attentionvote.setting import Setting
 
 if TYPE_CHECKING:
-    from attentionvote.evaluation.scene_result import Array
+    from attentionvote.evaluation.intervals import LeftOut
 
 PROVENANCE = ("commit", "data", "config", "versions", "signature")
 
@@ -76,11 +76,11 @@ class Evidence:
 
     Attributes:
         figures: of ``Measurement.figures``.
-        draws: of ``Measurement.resampled``; of two models with the same weights.
+        left_out: of ``Measurement.left_out``; of two models on the same scenes; none of a set of one drop cycle.
     """
 
     figures: Mapping[str, float]
-    draws: Mapping[str, Array] = field(repr=False)
+    left_out: Mapping[str, LeftOut] = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,6 @@ def judge(
 
 
 def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
-    from attentionvote.evaluation.bootstrap import interval  # scipy: not for a verb's help
-
     for name, floor in floors.items():
         value = candidate.figures.get(name)
         demands = f"{name} at least {floor:g}"
@@ -133,23 +131,24 @@ def _floors(floors: Mapping[str, float], candidate: Evidence) -> Iterator[Gate]:
             yield Gate(f"floor {name}", False, demands, "it was not measured")
             continue
         finding = f"{value:.4f}"
-        if name in candidate.draws:
-            sure = interval(candidate.draws[name])
+        if name in candidate.left_out:
+            sure = candidate.left_out[name].interval()
             finding += f" ({sure.low:.3f} to {sure.high:.3f})"
         yield Gate(f"floor {name}", value >= floor, demands, finding)
 
 
 def _not_worse(margins: Mapping[str, float], candidate: Evidence, champion: Evidence) -> Iterator[Gate]:
-    from attentionvote.evaluation.bootstrap import interval  # scipy: not for a verb's help
-
     for name, margin in margins.items():
         demands = f"{name} at most {margin:g} below the champion's"
-        if name not in candidate.draws or name not in champion.draws:
+        if name not in candidate.figures or name not in champion.figures:
             yield Gate(f"champion {name}", False, demands, "it was not measured for both")
             continue
-        difference = candidate.figures[name] - champion.figures[name]
-        sure = interval(candidate.draws[name] - champion.draws[name])
-        finding = f"{champion.figures[name]:.4f} {difference:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
+        if name not in candidate.left_out or name not in champion.left_out:
+            yield Gate(f"champion {name}", False, demands, "of one drop cycle no interval is known: measure on more")
+            continue
+        difference = candidate.left_out[name] - champion.left_out[name]
+        sure = difference.interval()
+        finding = f"{champion.figures[name]:.4f} {difference.value:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
         yield Gate(f"champion {name}", sure.low >= -margin, demands, finding)
 
 

@@ -42,10 +42,11 @@ def simulate_cycle(
     bin_size = spec.bin.sample(scale, rng)
     friction = float(rng.uniform(*spec.drop.friction))
     seeds = dict(zip(spec.drop_counts, scene_seeds, strict=True))
+    kept = spec.counts_of(cycle)
     records = []
     for bin_from_part in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng):
         count = len(bin_from_part)
-        if count not in seeds:
+        if count not in kept:
             continue
         scene_rng = np.random.default_rng(seeds[count])
         camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
@@ -67,6 +68,8 @@ def simulate_cycle(
                 part_ids=dropped_ids,
             )
         )
+        if count == kept[-1]:
+            break
     return records
 
 

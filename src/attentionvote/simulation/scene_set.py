@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from attentionvote.execution import Executor
 from attentionvote.files import waiting_lock, whole, write_json
@@ -66,6 +67,11 @@ class SceneSet:
     def records(self) -> Sequence[SceneRecord]:
         """All scenes, cycle by cycle, fewest parts first."""
         return [record for cycle in range(self.cycles) for record in load_records(_shard(self.directory, cycle))]
+
+    @property
+    def cycle_of_scene(self) -> NDArray[np.int64]:
+        """``(S,)`` which drop cycle each scene is of."""
+        return np.array([record.cycle for record in self.records], dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.records)
@@ -215,15 +221,15 @@ def _write_manifest(directory: Path, part: Parts, spec: SceneSetSpec, content: s
 
 def find_record(part: Parts, caster: PartCaster, spec: SceneSetSpec, directory: Path, scene: int) -> SceneRecord:
     """Scene number ``scene`` of a set, or of the cycle it would belong to, when the set is not complete."""
-    per_cycle = len(spec.drop_counts)
-    if scene >= spec.cycles * per_cycle:
-        raise ValueError(f"scene must be below {spec.cycles * per_cycle} in split {spec.split}; got {scene}")
+    places = [(cycle, entry) for cycle in range(spec.cycles) for entry in range(len(spec.counts_of(cycle)))]
+    if scene >= len(places):
+        raise ValueError(f"scene must be below {len(places)} in split {spec.split}; got {scene}")
     if SceneSet.is_complete(directory):
         records = SceneSet.open(directory).records
         if scene >= len(records):
             raise ValueError(f"scene must be below {len(records)}, the scenes in {directory}; got {scene}")
         return records[scene]
-    cycle, entry = divmod(scene, per_cycle)
+    cycle, entry = places[scene]
     log.info("%s is not generated yet: simulating its cycle %d", directory, cycle)
     cycle_records = simulate_cycle(part, solids_of(part, spec.drop), caster, spec, cycle)
     if not cycle_records:

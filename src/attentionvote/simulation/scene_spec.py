@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from attentionvote.part import Parts
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
 from attentionvote.simulation.camera import CameraSettings
 from attentionvote.simulation.drop_settings import BinSettings, DropSettings
 
@@ -33,6 +33,16 @@ class SimulationSettings:
     visibility_stride: Annotated[
         int, Setting("Visibility is measured on every so-many-th pixel in both directions.", low=1, high=8)
     ]
+    keep_every: Annotated[
+        dict[str, int],
+        Setting(
+            "Per split: a cycle keeps every so-many-th of drop_counts, each cycle begins one later; splits not named "
+            "keep all.",
+            low=1,
+            high=200,
+            identity=Identity.CHANGED,
+        ),
+    ] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,9 @@ class SceneSetSpec:
         drop_counts: a cycle's pile is kept after these drops.
         bin, camera, drop: their settings.
         visibility_stride: visibility is measured on every so-many-th pixel.
+        keep_every: a cycle keeps every so-many-th of ``drop_counts``, at least one, see ``counts_of``; 1 keeps all.
+            Consecutive piles of a cycle are nearly one picture, so as many scenes of more cycles say more. What is kept
+            is as it would be in the full cycle.
 
     Raises:
         ValueError: when a setting is impossible.
@@ -62,6 +75,7 @@ class SceneSetSpec:
     drop: DropSettings = field(default_factory=DropSettings)
     visibility_stride: int = 2
     format_version: int = FORMAT_VERSION
+    keep_every: int = 1
 
     def __post_init__(self) -> None:
         counts = tuple(int(c) for c in self.drop_counts)
@@ -76,10 +90,27 @@ class SceneSetSpec:
             raise ValueError(f"drop_counts must be increasing numbers within 1..200, got {list(counts)}")
         if not 1 <= self.visibility_stride <= 8:
             raise ValueError(f"visibility_stride must lie in 1..8, got {self.visibility_stride}")
+        if self.keep_every < 1:
+            raise ValueError(f"keep_every must be at least 1, got {self.keep_every}")
+
+    def counts_of(self, cycle: int) -> tuple[int, ...]:
+        """After which drops a cycle's pile is kept: cycle 0 begins with the first of ``drop_counts``, cycle 1 with the
+        second, and so on in turn, so that ``keep_every`` cycles have all of them between them."""
+        first = cycle % min(self.keep_every, len(self.drop_counts))
+        return self.drop_counts[first :: self.keep_every]
+
+    @property
+    def scenes(self) -> int:
+        """Number of scenes when no bin is full before its last drop."""
+        return sum(len(self.counts_of(cycle)) for cycle in range(self.cycles))
 
     def as_dict(self) -> dict:
-        """Plain JSON values, as written into the manifest."""
-        return json.loads(json.dumps(asdict(self)))
+        """Plain JSON values, as written into the manifest; ``keep_every`` only where it keeps less than all, so that
+        digests of before it came are the same."""
+        plain: dict = json.loads(json.dumps(asdict(self)))
+        if self.keep_every == 1:
+            del plain["keep_every"]
+        return plain
 
     def digest(self) -> str:
         """Sha256 of the specification."""
@@ -107,9 +138,8 @@ def scene_set_specs(part: Parts, settings: SimulationSettings) -> dict[str, Scen
         ValueError: when a setting is impossible.
     """
     s = settings
+    shared = s.seed, s.drop_counts, s.bin, s.camera, s.drop, s.visibility_stride
     return {
-        split: SceneSetSpec(
-            part.digest, split, cycles, s.seed, s.drop_counts, s.bin, s.camera, s.drop, s.visibility_stride
-        )
+        split: SceneSetSpec(part.digest, split, cycles, *shared, keep_every=s.keep_every.get(split, 1))
         for split, cycles in s.cycles.items()
     }

@@ -171,7 +171,7 @@ class PromotionJob:
 
     def _evidence(self, measured: Measurement) -> Evidence:
         part = self.evaluation.part
-        return Evidence(measured.figures(part), measured.resampled(part))
+        return Evidence(measured.figures(part), measured.left_out(part))
 
     def _instead(self) -> str:
         return f", instead of {self.standing.champion.number}" if self.standing.champion else ""

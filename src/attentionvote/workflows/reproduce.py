@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.reproduce")
 CONFIG, RESULT = "config.yaml", "result.json"
 _FIGURES = ("ap_10", "ap_5", "ap_2")
-_DRAWS = 2000
 
 
 @dataclass(frozen=True)
@@ -157,25 +156,34 @@ def reproduce(cfg: ReproduceSettings) -> dict[str, Any]:
 
 
 def paired_difference(was: Recorded, again: Mapping[str, Any], cfg: ReproduceSettings) -> dict[str, list[float]]:
-    """Test figures of the new weights minus those of the old, on the same scenes: value, and 95 % of the draws."""
-    from attentionvote.evaluation import evaluate_at, interval, resampled_figures, scene_weights
+    """Test figures of the new weights minus those of the old, on the same scenes: value, and 95 % interval.
+
+    Raises:
+        ValueError: when the test has one drop cycle, of which no interval is known.
+    """
+    from attentionvote.evaluation import left_out_figures
     from attentionvote.training.module import PoseTraining
     from attentionvote.workflows.train.pieces import part_data
 
     settings = TrainSettings.of({**was.settings, "root": _root(cfg)})
     part = settings.object()
-    figures, draws = [], []
+    figures = []
     for file in (was.model, Path(again["model"])):
         module = PoseTraining.load_from_checkpoint(file)
         data = part_data(settings, module)
         results = [result for batch in data.test_dataloader() for result in module.detect(batch)]
         point = float(module.metadata["confidence_threshold"] or 0.0)
-        figures.append(evaluate_at(results, part, point))
-        draws.append(resampled_figures(results, part, point, scene_weights(len(results), _DRAWS)))
+        figures.append(left_out_figures(results, data.test.cycles, part, point))
+    if not figures[0]:
+        raise ValueError(
+            f"the test of version {was.version} must have at least two drop cycles for an interval, got one: other "
+            "weights cannot be compared with its own"
+        )
     between = {}
     for name in _FIGURES:
-        sure = interval(draws[1][name] - draws[0][name])
-        between[name] = [round(v, 6) for v in (figures[1][name] - figures[0][name], sure.low, sure.high)]
+        difference = figures[1][name] - figures[0][name]
+        sure = difference.interval()
+        between[name] = [round(v, 6) for v in (difference.value, sure.low, sure.high)]
     return between
 
 

@@ -18,14 +18,24 @@ if TYPE_CHECKING:
 log = logging.getLogger("attentionvote.evaluate")
 
 
-def set_spec(cfg: MeasuredBundle, part: Parts, split: str | None = None, cycles: int | None = None) -> SceneSetSpec:
-    """What determines the frozen set; or cycles of another split of the same simulation.
+def set_spec(cfg: MeasuredBundle, part: Parts) -> SceneSetSpec:
+    """What determines the frozen set.
 
     Raises:
         ValueError: when a setting is impossible.
     """
-    split = split or cfg.evaluation.split
-    return scene_set_specs(part, replace(cfg.simulation, cycles={split: cycles or cfg.evaluation.cycles}))[split]
+    evaluation = cfg.evaluation
+    return _spec(cfg, part, evaluation.split, evaluation.cycles, evaluation.keep_every)
+
+
+def validation_spec(cfg: MeasuredBundle, part: Parts) -> SceneSetSpec:
+    """One whole cycle of validation scenes of the same simulation, to choose a working point on."""
+    return _spec(cfg, part, "val", 1, 1)
+
+
+def _spec(cfg: MeasuredBundle, part: Parts, split: str, cycles: int, keep_every: int) -> SceneSetSpec:
+    settings = replace(cfg.simulation, cycles={split: cycles}, keep_every={split: keep_every})
+    return scene_set_specs(part, settings)[split]
 
 
 def scenes_of(cfg: MeasuredBundle, part: Parts) -> MeasuredScenes:

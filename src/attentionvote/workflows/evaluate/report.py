@@ -55,8 +55,9 @@ def show(result: Mapping[str, Any]) -> None:
     """A table on stderr."""
     figures, sure = result["figures"], result["intervals"]
     head = f"{result['object']}, bundle {result['bundle'][:12]}, {result['scenes']} scenes"
-    columns = ("figure", "value", "95 % interval")
-    rows = [(title, f"{figures[name]:.4f}", "{:.3f} to {:.3f}".format(*sure[name])) for name, title in _TITLES.items()]
+    columns = ("figure", "value", "95 % interval" if sure else "one cycle, no interval")
+    within = {name: "{:.3f} to {:.3f}".format(*sure[name]) if name in sure else "" for name in _TITLES}
+    rows = [(title, f"{figures[name]:.4f}", within[name]) for name, title in _TITLES.items()]
     for name, value in figures.items():
         if name.startswith("recall_visible_"):
             low, high = name.split("_")[-2:]

@@ -121,7 +121,7 @@ def baseline_cell(
     from attentionvote.measurement.models import Measurement
     from attentionvote.tracking.provenance import git_state
     from attentionvote.training.operating_point import best_threshold
-    from attentionvote.workflows.evaluate.frozen_set import generated_set, is_recorded, scenes_of, set_spec
+    from attentionvote.workflows.evaluate.frozen_set import generated_set, is_recorded, scenes_of, validation_spec
 
     cfg = compose(EvaluateSettings, [f"object={name}", *evaluate])
     part: Part = cfg.object()
@@ -133,7 +133,7 @@ def baseline_cell(
     stored = read_json(path)
     if stored is not None and not cfg.force:
         return stored | {"frozen": is_recorded(cfg, part, frozen)}
-    validation = generated_set(cfg, part, set_spec(cfg, part, "val", 1))
+    validation = generated_set(cfg, part, validation_spec(cfg, part))
     log.info("%s, %s: %d scenes, and %d for its working point", row.name, name, len(frozen), len(validation))
     measured_sets = []
     for scenes in (validation, frozen):
@@ -141,7 +141,9 @@ def baseline_cell(
         bar = partial(_shown, title=f"{row.name}, {name}", total=len(clouds))
         measured_sets.append(ppf_results(part, clouds, settings, workers, shown=bar))
     (validation_results, _), (results, seconds) = measured_sets
-    measured = Measurement(row.detector, results, best_threshold(validation_results, part), seconds)
+    measured = Measurement(
+        row.detector, results, frozen.cycle_of_scene, best_threshold(validation_results, part), seconds
+    )
     cell = figures_of(measured, part) | {
         "scenes": len(frozen),
         "evaluation_set": frozen.digest,

@@ -55,7 +55,7 @@ class TrainingJob:
         """Number of scenes by split."""
         if self.dataset is not None:
             return {split: len(scenes) for split, scenes in self.dataset.splits.items()}
-        return {split: spec.cycles * len(spec.drop_counts) for split, spec in self.specs.items()}
+        return {split: spec.scenes for split, spec in self.specs.items()}
 
     @property
     def run_id(self) -> str | None:
