@@ -2,7 +2,7 @@
 
     make evaluate OBJECT=connecting_rod [ARGS="bundle=3fa9c1 evaluation.cycles=20"]
 
-Figures with 95 % bootstrap intervals over scenes, recall by visibility, and the time of an estimate on this machine;
+Figures with 95 % intervals over drop cycles, recall by visibility, and the time of an estimate on this machine;
 written into the MLflow run of the training and to outputs/evaluate. What is done is not repeated without force=true.
 """
 

@@ -11,7 +11,7 @@ import torch
 
 from attentionvote.data.augmentation import Augmentation
 from attentionvote.data.clouds import Clouds, measure_clouds
-from attentionvote.data.datamodule import EpochSampler, PartDataModule, scene_share
+from attentionvote.data.datamodule import CloudSamples, EpochSampler, PartDataModule, scene_share
 from attentionvote.data.samples import Batch
 from attentionvote.data.sensing import CloudSettings
 from attentionvote.model.neighborhoods import Layout
@@ -36,6 +36,15 @@ def test_an_epoch_is_reproducible_and_differs_from_the_next(clouds: Clouds, layo
     assert all(torch.equal(a, b) for a, b in zip(first, points(module(clouds, layout), 1), strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(first, points(module(clouds, layout), 2), strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(first, points(module(clouds, layout, seed=4), 1), strict=True))
+
+
+def test_samples_know_their_cycle_where_somebody_does(clouds: Clouds, layout: Layout) -> None:
+    samples = module(clouds, layout).test
+    assert list(samples.cycles) == [0, 0, 1, 1, 2]
+    samples.scenes = [1, 2, 4]  # as if the others had no points
+    assert list(samples.cycles) == [0, 1, 2]
+    own = CloudSamples([clouds[i] for i in range(5)], 64, layout, None, 3)
+    assert list(own.cycles) == [0, 1, 2, 3, 4]
 
 
 def test_a_loader_process_changes_nothing_over_epochs(clouds: Clouds, layout: Layout) -> None:

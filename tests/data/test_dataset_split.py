@@ -133,6 +133,8 @@ def test_the_digest_is_of_poses_visibility_and_camera(written: Path, box: Part, 
     same = split_of(tmp_path / kind, box)
     assert (same.digest, same.fingerprint) == (before.digest, before.fingerprint)
     assert len(before.fingerprint) == 16  # of two cycles
+    cycle_names = [list(before.cycles)[i] for i in before.cycle_of_scene]
+    assert cycle_names == [before.dataset.cycle_of(name) for name in before.names]
     camera = next((tmp_path / kind).rglob("parameter.json" if kind == "ipa" else "scene_camera.json"))
     camera.write_text(camera.read_text().replace('"clip_end": ', '"clip_end": 1').replace("300.0", "301.0"))
     other = split_of(tmp_path / kind, box)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from attentionvote.evaluation import LeftOut
 from attentionvote.export.parity_record import Limits, Parity
 from attentionvote.registry.gates import Evidence, Gate, Origin, Rules, judge
 
@@ -17,9 +18,10 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 ORIGIN = Origin(True, has_config=True, commits=(COMMIT,), has_changes=True, signed_by="feedfeedfeedfeed")
 
 
-def evidence(ap: float, spread: float = 0.0, p95: float = 300.0) -> Evidence:
-    draws = ap + spread * np.linspace(-1, 1, 2001)
-    return Evidence({"ap_10": ap, "latency_p50_ms": 200.0, "latency_p95_ms": p95}, {"ap_10": draws})
+def evidence(ap: float, reach: float = 0.0, p95: float = 300.0) -> Evidence:
+    """Of a model whose AP of 30 cycles has an interval that reaches so far."""
+    without = ap + reach / (2.04523 * np.sqrt(29)) * np.tile([-1, 1], 15)  # Student's t of 29
+    return Evidence({"ap_10": ap, "latency_p50_ms": 200.0, "latency_p95_ms": p95}, {"ap_10": LeftOut(ap, without)})
 
 
 @pytest.fixture
@@ -56,7 +58,7 @@ def test_too_small_a_set_proves_nothing(card, scenes, holds):
 def test_the_floor_is_inclusive_and_shows_the_interval(card, ap, holds):
     gate = judged(card, evidence(ap, 0.02))["floor ap_10"]
     assert gate.holds is holds
-    assert gate.finding == f"{ap:.4f} ({ap - 0.019:.3f} to {ap + 0.019:.3f})"
+    assert gate.finding == f"{ap:.4f} (0.879 to 0.919)"  # a little more room below than above
 
 
 def test_a_figure_that_was_not_measured_fails(card):
@@ -67,13 +69,21 @@ def test_a_figure_that_was_not_measured_fails(card):
 
 
 def test_no_worse_than_the_champion_means_that_a_larger_loss_is_excluded(card):
-    # The draws of both rise together, so their difference is certain: 0.009 below passes a margin of 0.01.
+    # Both hang on the same piles, so their difference is certain: 0.009 below passes a margin of 0.01.
     assert judged(card, evidence(0.941, 0.05), evidence(0.95, 0.05))["champion ap_10"].holds
     assert not judged(card, evidence(0.939, 0.05), evidence(0.95, 0.05))["champion ap_10"].holds
     # The same mean with a spread of the difference beyond the margin: not excluded.
     unsure = judged(card, evidence(0.95, 0.05), evidence(0.95, 0.0))["champion ap_10"]
     assert not unsure.holds
-    assert unsure.finding == "0.9500 +0.0000 (-0.0475 to +0.0475)"
+    assert unsure.finding == "0.9500 +0.0000 (-0.0500 to +0.0500)"
+
+
+def test_of_one_drop_cycle_nothing_is_excluded(card):
+    one = replace(evidence(0.95), left_out={})
+    gates = judged(card, one, one)
+    assert (gates["floor ap_10"].holds, gates["floor ap_10"].finding) == (True, "0.9500")
+    assert not gates["champion ap_10"].holds
+    assert gates["champion ap_10"].finding == "of one drop cycle no interval is known: measure on more"
 
 
 def test_a_better_model_passes_whatever_the_margin(card):

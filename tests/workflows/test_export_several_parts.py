@@ -90,7 +90,7 @@ def test_a_model_of_two_parts_becomes_a_bundle_and_is_evaluated(trained: Path) -
         answer = estimator.estimate_parts_only(cloud.points)
     assert [d.part for d in answer.detections] == [NAMES[k] for k in cloud.part_ids]  # type: ignore[union-attr]
 
-    words = ["simulation=smoke", "simulation.drop_counts=[2,4]", "evaluation.cycles=1", "evaluation.density=2000"]
+    words = ["simulation=smoke", "simulation.drop_counts=[2,4]", "evaluation.cycles=2", "evaluation.density=2000"]
     store = f"tracking.store={trained / 'mlflow.db'}"
     evaluated = python("evaluate.py", *OBJECT, *words, "workers=1", store, folder=trained)
     figures = evaluated["figures"]

@@ -24,6 +24,7 @@ from attentionvote.workflows.train.settings import TrainSettings
 pytestmark = pytest.mark.usefixtures("quick_training")
 TINY = [
     "object=brick", *TINY_TRAINING, "simulation.drop_counts=[1,2]", "workers=1", "trainer.max_epochs=4",
+    "simulation.cycles.test=2",
     "trainer.validate_every=2", "force=false", "object.title='A brick, \"quoted\"'",
 ]  # fmt: skip
 
@@ -87,6 +88,11 @@ def test_other_weights_are_compared_on_the_same_scenes(registry: Registry, monke
     assert answer["difference"].keys() == {"ap_10", "ap_5", "ap_2"}
     for value, low, high in answer["difference"].values():
         assert low <= value <= high
+    cfg = compose(ReproduceSettings, ["object=brick", f"outputs={registry.folder / 'again'}", "workers=1"])
+    was = room.Recorded(int(version), "", {**compose(TrainSettings, TINY).composed}, {}, {}, {}, Path(other["model"]))
+    was.settings["simulation"]["cycles"]["test"] = 1
+    with pytest.raises(ValueError, match=rf"the test of version {version} must have at least two drop cycles for an"):
+        room.paired_difference(was, registry.first, cfg)
     monkeypatch.setattr(room, "paired_difference", lambda *_: {"ap_10": [-0.1, -0.2, -0.01], "ap_5": [0, -1, 1]})
     with pytest.raises(Refused, match=rf"version {version} is not reproduced: ap_10 differ by more than"):
         registry.reproduce("again", f"version={version}")

@@ -3,8 +3,9 @@
 A figure is computed again without each drop cycle in turn; from how much these differ follows how much it would differ
 on other piles. Drop cycles are the unit, neither poses nor scenes: the parts of one pile are found or missed together,
 and the scenes of one cycle are a pile that grows. Cycles are few, so the interval has Student's quantile in place of
-the normal one. Two models on the same scenes are compared without the same cycles (paired), which removes what both
-find hard. What it does not say: how much another training, another seed say, would differ.
+the normal one, and a share near 1 varies less than one near a half, so it is made on the scale on which all vary alike
+(arcsine of the root). Two models on the same scenes are compared without the same cycles (paired), which removes what
+both find hard. What an interval does not say: how much another training, of another seed say, would differ.
 """
 
 from __future__ import annotations
@@ -28,26 +29,33 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """Holds the figure of all piles, not only those drawn, in ``LEVEL`` of all sets: from ``low`` to ``high``."""
+    """A value of these piles, and ``low`` to ``high``: of ``LEVEL`` of all sets of piles, it holds the value of all."""
 
+    value: float
     low: float
     high: float
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A figure, or the difference of two models', of all cycles and without each.
+    """A figure between 0 and 1 of all drop cycles and without each.
 
     Attributes:
         value: of all.
-        without: ``(C,)`` without cycle 0, without cycle 1, ...
+        without: ``(C,)`` without cycle 0, without cycle 1, ...; at least two.
     """
 
     value: float
     without: Array = field(repr=False)
 
-    def __sub__(self, other: LeftOut) -> LeftOut:
-        """The difference on the same scenes.
+    def interval(self) -> Interval:
+        """Of the figure."""
+        angle, reach = float(_angle(self.value)), _reach(_angle(self.without))
+        low, high = np.sin(np.clip([angle - reach, angle + reach], 0, np.pi / 2)) ** 2
+        return Interval(self.value, float(low), float(high))
+
+    def minus(self, other: LeftOut) -> Interval:
+        """Of the difference to another figure on the same scenes.
 
         Raises:
             ValueError: when the other figure is not of as many cycles.
@@ -56,20 +64,18 @@ class LeftOut:
             raise ValueError(
                 f"a difference must be of figures of the same cycles, got {len(self.without)} and {len(other.without)}"
             )
-        return LeftOut(self.value - other.value, self.without - other.without)
+        value, reach = self.value - other.value, _reach(self.without - other.without)
+        return Interval(value, value - reach, value + reach)
 
-    def interval(self, level: float = LEVEL) -> Interval:
-        """Where the figure of all piles lies.
 
-        Raises:
-            ValueError: when the level is no share between 0 and 1.
-        """
-        if not 0 < level < 1:
-            raise ValueError(f"the level of an interval must lie between 0 and 1, got {level}")
-        cycles = len(self.without)
-        error = np.sqrt((cycles - 1) * np.var(self.without))
-        reach = float(stdtrit(cycles - 1, (1 + level) / 2) * error)
-        return Interval(self.value - reach, self.value + reach)
+def _angle(share: Array | float) -> Array:
+    return np.arcsin(np.sqrt(np.clip(share, 0, 1)))
+
+
+def _reach(without: Array) -> float:
+    """Half the width of the interval of what has these values ``(C,)`` without each cycle."""
+    cycles = len(without)
+    return float(stdtrit(cycles - 1, (1 + LEVEL) / 2) * np.sqrt((cycles - 1) * np.var(without)))
 
 
 def left_out_figures(

@@ -146,9 +146,8 @@ def _not_worse(margins: Mapping[str, float], candidate: Evidence, champion: Evid
         if name not in candidate.left_out or name not in champion.left_out:
             yield Gate(f"champion {name}", False, demands, "of one drop cycle no interval is known: measure on more")
             continue
-        difference = candidate.left_out[name] - champion.left_out[name]
-        sure = difference.interval()
-        finding = f"{champion.figures[name]:.4f} {difference.value:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
+        sure = candidate.left_out[name].minus(champion.left_out[name])
+        finding = f"{champion.figures[name]:.4f} {sure.value:+.4f} ({sure.low:+.4f} to {sure.high:+.4f})"
         yield Gate(f"champion {name}", sure.low >= -margin, demands, finding)
 
 

@@ -179,12 +179,8 @@ def paired_difference(was: Recorded, again: Mapping[str, Any], cfg: ReproduceSet
             f"the test of version {was.version} must have at least two drop cycles for an interval, got one: other "
             "weights cannot be compared with its own"
         )
-    between = {}
-    for name in _FIGURES:
-        difference = figures[1][name] - figures[0][name]
-        sure = difference.interval()
-        between[name] = [round(v, 6) for v in (difference.value, sure.low, sure.high)]
-    return between
+    between = {name: figures[1][name].minus(figures[0][name]) for name in _FIGURES}
+    return {name: [round(v, 6) for v in (sure.value, sure.low, sure.high)] for name, sure in between.items()}
 
 
 def _trained_again(cfg: ReproduceSettings, was: Recorded) -> dict[str, Any]:

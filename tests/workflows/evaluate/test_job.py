@@ -56,6 +56,14 @@ def test_figures_go_to_the_json_line_the_file_and_the_trainings_run(run, export_
     assert again["figures"]["ap_10"] == result["figures"]["ap_10"]
 
 
+def test_a_set_of_one_cycle_has_figures_and_no_interval(run, export_brick, capsys):
+    export_brick("model")
+    result = run("evaluation.cycles=1", "evaluation.keep_every=1")
+    assert (result["scenes"], result["intervals"]) == (2, {})
+    assert {"ap_10", "recall_10"} <= set(result["figures"])
+    assert "one cycle, no interval" in " ".join(capsys.readouterr().err.split())
+
+
 def test_another_peak_threshold_is_another_evaluation_and_not_the_runs_figures(run, export_brick, put_tables, tmp_path):
     store = put_tables(tmp_path / "mlflow.db")
     with start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:

@@ -203,7 +203,7 @@ def test_a_part_that_ends_its_workers_is_one_that_failed() -> None:
 @pytest.mark.slow
 def test_a_fleet_goes_on_with_the_real_verbs_and_one_part_fails(export_brick: Any, tmp_path: Path) -> None:
     """The brick was trained and exported before a fleet was stopped; something lies in the way of the gear's scenes."""
-    few = ["simulation=smoke", "simulation.drop_counts=[2,3]", "evaluation.cycles=1", "evaluation.density=2000"]
+    few = ["simulation=smoke", "simulation.drop_counts=[2,3]", "evaluation.cycles=2", "evaluation.density=2000"]
     words = ["objects='gear,brick'", *TINY, "outputs=outputs/train", "root=data", "tracking.store=mlflow.db"]
     words += ["export=['scenes=32']", f"evaluate={few}"]
     bundle = export_brick("model", "feed" * 8)

@@ -26,8 +26,8 @@ from attentionvote.workflows.train.job import find_training
 from attentionvote.workflows.train.settings import TrainSettings
 
 ROOT = Path(__file__).resolve().parents[3]
-# One cycle of two scenes with a few bricks.
-FEW = ["evaluation.cycles=1", "evaluation.density=2000", "evaluate=['simulation=smoke','simulation.drop_counts=[2,3]']"]
+# Two cycles of a scene with a few bricks.
+FEW = ["evaluation.cycles=2", "evaluation.density=2000", "evaluate=['simulation=smoke','simulation.drop_counts=[2,3]']"]
 COARSE = ["baseline_workers=1", "ppf.sampling=0.15"]
 PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "page=page.md"]
 

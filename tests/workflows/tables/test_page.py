@@ -57,6 +57,12 @@ def test_the_papers_ours_and_what_was_not_run_stand_side_by_side() -> None:
     )
 
 
+def test_a_set_of_one_cycle_has_no_interval() -> None:
+    assert "| ours | brick | 13 | none | 56 ms |" in markdown(
+        TABLE, {("ours", "brick"): cell(0.9, intervals={}, scenes=13)}, None
+    )
+
+
 def test_the_mean_is_of_all_objects_or_not_there() -> None:
     text = markdown(TABLE, {("ours", "brick"): cell(0.9), ("ours", "gear"): cell(0.8)}, None)
     assert "| **ours** | 0.900 | 0.800 | 0.850 |" in text
