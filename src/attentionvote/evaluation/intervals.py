@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from attentionvote.evaluation.by_part import by_part
-from attentionvote.evaluation.matching import ScoreCurve, score_curve
+from attentionvote.evaluation.matching import score_curve
 from attentionvote.evaluation.pose_distance import PoseMetric
 from attentionvote.evaluation.scene_result import Array, SceneResult, distance_tables
 from attentionvote.evaluation.scores import DETAIL_THRESHOLD, THRESHOLDS
@@ -117,21 +117,23 @@ def _weighted_figures(
     """The figures ``(B,)`` of scenes with weights ``(B, S)``: how often each counts."""
     tables = distance_tables(scenes, PoseMetric.of(part))
     shares = weights / weights.sum(axis=1, keepdims=True)
-
-    def curves_at(fraction: float) -> list[ScoreCurve]:
-        pairs = zip(scenes, tables, strict=True)
-        return [score_curve(table, s.scores, s.to_find(), fraction * part.diameter) for s, table in pairs]
-
+    curves_at = {
+        fraction: [
+            score_curve(table, scene.scores, scene.to_find(), fraction * part.diameter)
+            for scene, table in zip(scenes, tables, strict=True)
+        ]
+        for fraction in {*THRESHOLDS, DETAIL_THRESHOLD}
+    }
     figures = {}
     for fraction in THRESHOLDS:
-        curves = curves_at(fraction)
+        curves = curves_at[fraction]
         levels = np.unique(np.concatenate([curve.scores for curve in curves]))[::-1]
         at = [curve.at(levels) for curve in curves]
         precision = np.array([curve.precision[i] for curve, i in zip(curves, at, strict=True)])
         recall = np.array([curve.recall[i] for curve, i in zip(curves, at, strict=True)])
         area = np.sum((shares @ precision) * np.diff(shares @ recall, axis=1, prepend=0.0), axis=1)
         figures[f"ap_{100 * fraction:g}"] = area
-    curves = curves_at(DETAIL_THRESHOLD)
+    curves = curves_at[DETAIL_THRESHOLD]
     points = [curve.at(np.array([working_point]))[0] for curve in curves]
     right = weights @ np.array([curve.true_positives[i] for curve, i in zip(curves, points, strict=True)])
     wrong = weights @ np.array([curve.false_positives[i] for curve, i in zip(curves, points, strict=True)])
