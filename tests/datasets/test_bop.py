@@ -1,4 +1,4 @@
-"""The BOP format: written and read back, sensors as suffixes, models and their symmetries, what is refused."""
+"""The BOP format: written and read back, sensors as suffixes, meshes, what is refused."""
 
 from __future__ import annotations
 
@@ -16,10 +16,8 @@ from PIL import Image
 
 from attentionvote.datasets import PinholeCamera, open_datasets
 from attentionvote.datasets.bop import BopDataset
-from attentionvote.datasets.bop_models import read_models_info, write_models
-from attentionvote.datasets.bop_writer import BopSceneWriter
-from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion, rotation_angle, transform
-from attentionvote.geometry.symmetry import Symmetry
+from attentionvote.datasets.bop_writer import BopSceneWriter, write_models
+from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part
 
 COUNTS = (0, 2, 5)
@@ -185,30 +183,6 @@ def test_any_camera_and_pose_survives(
     np.testing.assert_allclose(frame.depth, depth, atol=0.0501 / 1000)
 
 
-@pytest.mark.parametrize(
-    "symmetry",
-    [
-        Symmetry(),
-        Symmetry("cyclic", (0, 1, 0), 4),
-        Symmetry("dihedral", (0, 0, 1), 3, flip_axis=(1, 0, 0)),
-        Symmetry("revolution", (1, 0, 0)),
-        Symmetry("revolution", (0, 0.6, 0.8), flip=True),
-    ],
-)
-def test_models_are_read_back_with_diameter_and_symmetry(tmp_path: Path, box: Part, symmetry: Symmetry) -> None:
-    write_models(tmp_path, {3: Part("part", box.vertices, box.faces, 0.08, symmetry)})
-    read = read_models_info(tmp_path / "models_info.json")[3]
-    np.testing.assert_allclose(read.diameter, np.sqrt(0.06**2 + 0.04**2 + 0.02**2))
-    assert read.symmetry.is_revolution == symmetry.is_revolution
-    if symmetry.is_revolution:
-        np.testing.assert_allclose(read.symmetry.axis, symmetry.axis, atol=1e-12)
-        assert read.symmetry.flip == symmetry.flip
-        return
-    ours, theirs = symmetry.rotations(), read.symmetry.rotations()
-    assert len(ours) == len(theirs)
-    assert rotation_angle(ours[:, None], theirs).min(axis=1).max() < 1e-6
-
-
 def test_a_mesh_is_written_in_millimetres(tmp_path: Path, box: Part) -> None:
     import trimesh
 
@@ -216,35 +190,3 @@ def test_a_mesh_is_written_in_millimetres(tmp_path: Path, box: Part) -> None:
     mesh = trimesh.load(tmp_path / "obj_000001.ply", process=False)
     np.testing.assert_allclose(mesh.vertices, box.vertices * 1000, atol=1e-4)
     np.testing.assert_array_equal(mesh.faces, box.faces)
-
-
-def test_generators_alone_are_completed_to_a_group(tmp_path: Path) -> None:
-    # A BOP entry need list no more than what its own tools expand; a quarter turn stands for four rotations.
-    quarter = [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-    path = tmp_path / "models_info.json"
-    path.write_text(json.dumps({"1": {"diameter": 100, "symmetries_discrete": [quarter]}}))
-    assert len(read_models_info(path)[1].symmetry.rotations()) == 4
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ({"diameter": 0}, "diameter of object 5 must be positive millimetres, got 0"),
-        ({}, "the key diameter must be there"),
-        (
-            {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [3, 0, 40]}]},
-            "object 5 must have symmetry axes through its origin, within 1% of the diameter, got one 3 mm off",
-        ),
-        (
-            {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0] * 3}, {"axis": [1, 0, 0], "offset": [0] * 3}]},
-            r"object 5 must have one axis of revolution, got others beside \[0.0, 0.0, 1.0\]",
-        ),
-        ({"symmetries_discrete": [[1] * 15]}, "symmetries_discrete of 16 numbers"),
-        ({"symmetries_discrete": [[-1, *[0] * 4, 1, *[0] * 4, 1, *[0] * 4, 1]]}, "rotations as symmetries_discrete"),
-    ],
-)
-def test_symmetries_that_are_none_of_ours_are_refused(tmp_path: Path, entry: dict[str, Any], message: str) -> None:
-    path = tmp_path / "models_info.json"
-    path.write_text(json.dumps({"5": {"diameter": 100, **entry} if entry else {}}))
-    with pytest.raises(ValueError, match=message):
-        read_models_info(path)

@@ -223,14 +223,22 @@ def test_poses_without_pictures_are_read_all_the_same(copy: Path) -> None:
     assert "looks like millimetres" in units
 
 
-def test_a_damaged_list_of_poses_is_a_finding(tmp_path: Path, make_pile: Callable[..., Any], box: Any) -> None:
-    from attentionvote.datasets.bop_models import write_models
+def test_damaged_models_and_poses_are_findings(tmp_path: Path, make_pile: Callable[..., Any], box: Any) -> None:
+    from attentionvote.datasets.bop_writer import write_models
 
     write_models(tmp_path / "boxes" / "models", {1: box})
     writer = BopSceneWriter(tmp_path / "boxes" / "test" / "000000")
     pile = make_pile(2)
     writer.write(0, pile.pinhole, *pile[1:6], [1, 1])
     writer.finish()
+    assert report(tmp_path).errors == ()
+    info = tmp_path / "boxes" / "models" / "models_info.json"
+    models = json.loads(info.read_text())
+    models["1"]["symmetries_continuous"] = [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]
+    info.write_text(json.dumps(models))
+    (axis,) = report(tmp_path).errors
+    assert axis == f"{info}: object 1: symmetries_continuous[0]: axis must have a direction, got [0, 0, 0]"
+    write_models(tmp_path / "boxes" / "models", {1: box})
     (tmp_path / "boxes" / "test" / "000000" / "scene_gt.json").write_text("{")
     errors = report(tmp_path).errors
     assert errors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from bop_split import HEADER, csv_row
 
-from attentionvote.evaluation.bop_files import parse_name, read_estimates, read_models_info, read_targets, read_truth
+from attentionvote.evaluation.bop_files import parse_name, read_estimates, read_targets, read_truth
 
 TURN = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
 ROW = csv_row(2, 30, 5, 0.25, TURN, [10, 20, 800], 1.5)
@@ -129,31 +129,6 @@ def test_visibility_is_needed(bop_split):
     (bop_split.gt / "000002" / "scene_gt_info.json").unlink()
     with pytest.raises(ValueError, match=r"scene_gt_info\.json: the file cannot be read"):
         read_truth(bop_split.gt)
-
-
-def test_models_are_read_in_metres_with_their_symmetries(bop_split):
-    models = read_models_info(bop_split.models / "models_info.json")
-    assert {number: len(model.symmetries) for number, model in models.items()} == {1: 1, 5: 2, 7: 315}
-    np.testing.assert_allclose(models[5].symmetries[1][:3, 3], [0.002, 0, 0])
-    np.testing.assert_allclose(models[7].symmetries[100] @ [0, 0.003, 0.5, 1], [0, 0.003, 0.5, 1], atol=1e-15)
-    info = json.loads((bop_split.models / "models_info.json").read_text())
-    assert models[1].diameter == pytest.approx(info["1"]["diameter"] / 1000)
-
-
-@pytest.mark.parametrize(
-    ("edit", "text"),
-    [
-        (lambda c: c["5"].pop("diameter"), "object 5 must have diameter, got only symmetries_discrete"),
-        (lambda c: c["5"].update(diameter=0), "object 5 must have a positive diameter, got 0"),
-        (lambda c: c["5"].update(symmetries_discrete=[[1] * 9]), "object 5: symmetries_discrete must be 16 finite"),
-        (lambda c: c["5"].update(symmetries_discrete=[[2] * 16]), r"symmetries_discrete\[0\] must be a rotation"),
-        (lambda c: c["7"]["symmetries_continuous"][0].pop("axis"), "object 7 must have axis, got only offset"),
-    ],
-)
-def test_wrong_models_are_named(bop_split, edit, text):
-    change(bop_split.models / "models_info.json", edit)
-    with pytest.raises(ValueError, match=text):
-        read_models_info(bop_split.models / "models_info.json")
 
 
 def test_targets_are_images(tmp_path):

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from bop_split import csv_row
 
-from attentionvote.evaluation.bop_files import BopModel, BopPoses, read_estimates, read_models_info, read_truth
-from attentionvote.evaluation.bop_scores import LENGTHS_MM, SHARES, bop_scores
+from attentionvote.evaluation.bop_files import BopPoses, read_estimates, read_truth
+from attentionvote.evaluation.bop_scores import LENGTHS_MM, SHARES, ScoredModel, bop_scores
 from attentionvote.geometry.pose import rotation_about, transform
+from attentionvote.workflows.score.bop import scored_models
 
 GRID = [0.05 + 0.05 * k for k in range(10)]
 # The corners of a rod of 100 mm.
 ROD = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.0) for z in (0, 0.0)])
-MODELS, VERTICES = {1: BopModel(0.1, np.eye(4)[None])}, {1: ROD}
+MODELS, VERTICES = {1: ScoredModel(0.1, np.eye(4)[None])}, {1: ROD}
 
 
 def slow_scores(split, limit: int) -> tuple[float, float, dict[int, float]]:
@@ -94,7 +95,7 @@ def slow_ap(images, threshold: float, unit: float) -> float:
 
 def read(split, limit: int = 100):
     truth, images = read_truth(split.gt)
-    models = read_models_info(split.models / "models_info.json")
+    models = scored_models(split.models / "models_info.json")
     vertices = {number: ply_vertices(split.models / f"obj_{number:06d}.ply") / 1000 for number in (1, 5, 7)}
     return bop_scores(read_estimates(split.results)[0], truth, images, models, vertices, limit)
 
@@ -111,6 +112,31 @@ def test_the_score_is_the_published_rule_s(bop_split, limit):
     assert got.images == 3
     assert (got.beyond_limit > 0) == (limit == 6)
     assert got.elsewhere > 0  # object 9 is in no image
+
+
+def test_symmetries_that_are_nearly_a_group_are_scored_as_the_file_has_them(bop_split, caplog):
+    # LINEMOD's glue: a half turn of 178.5 degrees; the toolkit knows no other.
+    path = bop_split.models / "models_info.json"
+    infos = json.loads(path.read_text())
+    off = rotation_about((0, 0.02, 1), np.radians(178.5))
+    infos["5"]["symmetries_discrete"] = [transform(off, (2, 0, 0)).ravel().tolist()]
+    path.write_text(json.dumps(infos))
+    share, mm, per_object = slow_scores(bop_split, 100)
+    got = read(bop_split)
+    assert (got.map, got.map_mm) == (pytest.approx(share, abs=1e-12), pytest.approx(mm, abs=1e-12))
+    assert (got.per_object[5].map, got.per_object[5].map_mm) == pytest.approx(per_object[5], abs=1e-12)
+    symmetries = scored_models(path)[5].symmetries
+    np.testing.assert_array_equal(symmetries[:, :3, :3], [np.eye(3), off])
+    assert "object 5: its symmetries are off by up to 1.5 degrees" in caplog.text
+
+
+def test_the_symmetries_of_a_model_are_all_of_the_file_s_in_metres(bop_split):
+    models = scored_models(bop_split.models / "models_info.json")
+    assert {number: len(model.symmetries) for number, model in models.items()} == {1: 1, 5: 2, 7: 315}
+    np.testing.assert_allclose(models[5].symmetries[1][:3, 3], [0.002, 0, 0])
+    np.testing.assert_allclose(models[7].symmetries[100] @ [0, 0.003, 0.5, 1], [0, 0.003, 0.5, 1], atol=1e-15)
+    info = json.loads((bop_split.models / "models_info.json").read_text())
+    assert models[1].diameter == pytest.approx(info["1"]["diameter"] / 1000)
 
 
 def test_the_thresholds_are_the_toolkit_s():
@@ -162,7 +188,7 @@ def test_the_score_ignores_a_common_motion_the_order_and_the_scale_of_scores(bop
     truth, images = read_truth(bop_split.gt)
     estimates = read_estimates(bop_split.results)[0]
     estimates = estimates._replace(values=rng.permutation(len(estimates.values)) / 7.0)  # no ties: their order counts
-    models = read_models_info(bop_split.models / "models_info.json")
+    models = scored_models(bop_split.models / "models_info.json")
     vertices = {number: ply_vertices(bop_split.models / f"obj_{number:06d}.ply") / 1000 for number in (1, 5, 7)}
     expected = bop_scores(estimates, truth, images, models, vertices)
     motion = make_poses(rng, 1)[0]

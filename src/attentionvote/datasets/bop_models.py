@@ -1,65 +1,75 @@
-"""Models of a BOP dataset: diameter and symmetry from ``models_info.json``, and the writer of both and of the meshes.
+"""The one reader of BOP's ``models_info.json``: for datasets, for the API and for ``make score``.
 
-BOP's diameter is the largest vertex distance. Lengths are millimetres in the files and metres here.
+BOP's diameter is the largest vertex distance. Lengths are millimetres in the file and metres here. A symmetry is kept
+twice: as the file has it, which BOP's own score expands, and as the nearest group of rotations (``bop_symmetry``).
 """
 
 from __future__ import annotations
 
-import json
+import logging
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
-from scipy.spatial.distance import pdist
 
-from attentionvote.datasets.text_files import number, read_json
-from attentionvote.geometry.pose import quaternion_from_matrix, transform
+from attentionvote.datasets.bop_symmetry import Axes, nearest_group
+from attentionvote.datasets.text_files import read_json
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.part import Part
+
+log = logging.getLogger("attentionvote.datasets")
 
 MODELS_INFO = "models_info.json"
 FOLDERS = ("models", "models_eval", "models_cad", "models_reconst")
-# A symmetry's axis may miss the model's origin by this share of the diameter.
-OFFSET_SHARE = 0.01
-MOST_ROTATIONS = 64
+LARGEST_FILE = 64 * 2**20  # bytes; a model with the most symmetries takes one and a half million
+MOST_SYMMETRIES = 4096  # discrete ones times axes, of a model; each may become 315 matrices
+# Millimetres: from the smallest part that `make part` takes, and beyond the largest.
+SMALLEST, LARGEST = 1.0, 10_000.0
+# The largest vertex distance is between the longest side of the box and its diagonal; other meshes of the same part,
+# rounded ones and those with fewer vertices, differ by less than this factor.
+SLACK = 2.0
+# Of R R^T from I: three digits make 0.002, two make 0.02.
+ROTATION_ERROR = 0.005
+DISCRETE, CONTINUOUS = "symmetries_discrete", "symmetries_continuous"
 
 
 class BopModel(NamedTuple):
-    """``diameter`` in metres and ``symmetry`` in the model's own frame."""
+    """What the file says of one model.
+
+    Attributes:
+        diameter: metres.
+        discrete: ``(K, 4, 4)`` symmetries as the file lists them, ``part_from_part``, metres.
+        continuous: axis ``(3,)`` and a point ``(3,)`` on it, metres, of every axis of revolution, as the file has them.
+        symmetry: the nearest group, about ``center``; None for a ball, which no ``Symmetry`` describes.
+        center: ``(3,)`` metres, the point that no symmetry moves; of several the nearest to the model's origin.
+    """
 
     diameter: float
-    symmetry: Symmetry
+    discrete: NDArray[np.float64]
+    continuous: Axes
+    symmetry: Symmetry | None
+    center: NDArray[np.float64]
 
 
 def read_models_info(path: Path) -> dict[int, BopModel]:
-    """Every model of a ``models_info.json`` by its object id.
+    """Every model of a ``models_info.json`` by its object id; symmetries that are slightly off are said in the log.
 
     Raises:
-        ValueError: with one sentence, when an entry is impossible, or has a symmetry that no ``Symmetry`` is.
+        ValueError: with one sentence naming the object and the rule, when the file is ambiguous or impossible.
     """
-    models = {}
-    for key, entry in read_json(path, dict).items():
-        if not re.fullmatch(r"\d+", key) or not isinstance(entry, dict):
-            raise ValueError(f"{path}: every key must be an object id with a mapping, got {key!r}")
-        diameter = number(path, entry, "diameter")
-        if not diameter > 0:
-            raise ValueError(f"{path}: the diameter of object {key} must be positive millimetres, got {diameter}")
-        models[int(key)] = BopModel(diameter / 1000, _symmetry(f"{path}: object {key}", entry, diameter))
-    return models
+    return {number: _model(where, entry) for number, (where, entry) in _entries(path).items()}
 
 
 def read_diameters(path: Path) -> dict[int, float]:
-    """Diameters in metres by object id; the symmetries are not looked at.
+    """Diameters in metres by object id, where the symmetries do not matter.
 
     Raises:
-        ValueError: with one sentence, when an entry has none.
+        ValueError: as ``read_models_info``, but for the symmetries.
     """
-    content = read_json(path, dict)
-    return {int(k): number(path, entry, "diameter") / 1000 for k, entry in content.items() if k.isdigit()}
+    return {number: _diameter(where, entry) / 1000 for number, (where, entry) in _entries(path).items()}
 
 
 def models_info_of(split: Path) -> Path | None:
@@ -70,83 +80,122 @@ def models_info_of(split: Path) -> Path | None:
     return None
 
 
-def write_models(folder: Path, parts: Mapping[int, Part]) -> None:
-    """Write ``models_info.json`` and a PLY in millimetres of every part, by object id."""
-    folder.mkdir(parents=True, exist_ok=True)
-    info = {}
-    for object_id, part in parts.items():
-        low, size = part.vertices.min(axis=0) * 1000, np.ptp(part.vertices, axis=0) * 1000
-        entry: dict[str, Any] = {
-            "diameter": float(pdist(part.vertices[ConvexHull(part.vertices).vertices]).max() * 1000)
-        }
-        entry |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
-        entry |= {f"size_{axis}": float(value) for axis, value in zip("xyz", size, strict=True)}
-        turns = part.symmetry.rotations()[1:]
-        if len(turns):
-            entry["symmetries_discrete"] = transform(turns, np.zeros(3)).reshape(-1, 16).tolist()
-        if part.symmetry.is_revolution:
-            entry["symmetries_continuous"] = [{"axis": list(part.symmetry.axis), "offset": [0, 0, 0]}]
-        info[str(object_id)] = entry
-        (folder / f"obj_{object_id:06d}.ply").write_text(_ply(part), encoding="ascii")
-    (folder / MODELS_INFO).write_text(json.dumps(info, indent=2) + "\n", encoding="utf-8")
+def box_agrees(diameter: float, sizes: Sequence[float]) -> bool:
+    """Whether a diameter and the three sides of a model's box can be of one part in one unit, with some slack."""
+    return max(sizes) / SLACK <= diameter <= math.hypot(*sizes) * SLACK
 
 
-def _ply(part: Part) -> str:
-    head = ["ply", "format ascii 1.0", f"element vertex {len(part.vertices)}"]
-    head += [f"property float {axis}" for axis in "xyz"]
-    head += [f"element face {len(part.faces)}", "property list uchar int vertex_indices", "end_header"]
-    vertices = [" ".join(f"{value:.6g}" for value in vertex) for vertex in part.vertices * 1000]
-    faces = [f"3 {a} {b} {c}" for a, b, c in part.faces]
-    return "\n".join([*head, *vertices, *faces]) + "\n"
+def _entries(path: Path) -> dict[int, tuple[str, Mapping[str, Any]]]:
+    """Every object's entry by its id, with the beginning of a sentence about it."""
+    if path.is_file() and (size := path.stat().st_size) > LARGEST_FILE:
+        raise ValueError(f"{path}: the file must have at most {LARGEST_FILE} bytes, got {size}")
+    entries: dict[int, tuple[str, Mapping[str, Any]]] = {}
+    content = read_json(path, dict)
+    for key, entry in content.items():
+        if not re.fullmatch("0|[1-9][0-9]*", key):
+            number = str(int(key)) if key.isdecimal() else ""
+            problem = f"write {number!r}" if number else "a model's entry belongs under its number"
+            if number in content:
+                problem = f"it is there beside {number!r}, which is the same object"
+            raise ValueError(f"{path}: every key must be an object id without leading zeros, got {key!r}: {problem}")
+        if not isinstance(entry, dict):
+            raise ValueError(f"{path}: object {key} must be a JSON object with its diameter, got {entry!r:.60}")
+        entries[int(key)] = f"{path}: object {key}", entry
+    return entries
 
 
-def _symmetry(where: str, entry: Mapping[str, Any], diameter_mm: float) -> Symmetry:
-    try:
-        discrete = np.asarray(entry.get("symmetries_discrete", []), dtype=np.float64).reshape(-1, 4, 4)
-        continuous = [
-            (np.asarray(e["axis"], dtype=np.float64).reshape(3), np.asarray(e["offset"], dtype=np.float64).reshape(3))
-            for e in entry.get("symmetries_continuous", [])
-        ]
-    except (TypeError, ValueError, KeyError) as error:
+def _diameter(where: str, entry: Mapping[str, Any]) -> float:
+    """Millimetres."""
+    diameter = float(_numbers(where, entry, "diameter", 1)[0])
+    if diameter <= 0:
+        raise ValueError(f"{where} must have a positive diameter in millimetres, got {diameter:g}")
+    keys = [f"{name}_{axis}" for name in ("min", "size") for axis in "xyz"]
+    box = {key: float(_numbers(where, entry, key, 1)[0]) for key in keys if key in entry}
+    sizes = [box[key] for key in keys[3:] if key in box]
+    if min(sizes, default=0.0) < 0:
+        raise ValueError(f"{where} must have a size_x, size_y and size_z of at least 0, got {min(sizes):g}")
+    if len(sizes) == 3 and not box_agrees(diameter, sizes):
         raise ValueError(
-            f"{where} must have symmetries_discrete of 16 numbers and symmetries_continuous of axis and offset"
-        ) from error
-    # The part of an offset along the axis is no offset.
-    offsets = [np.linalg.norm(pose[:3, 3]) for pose in discrete]
-    offsets += [np.linalg.norm(np.cross(axis, offset)) / np.linalg.norm(axis) for axis, offset in continuous]
-    if max(offsets, default=0.0) > OFFSET_SHARE * diameter_mm:
-        raise ValueError(
-            f"{where} must have symmetry axes through its origin, within {OFFSET_SHARE:.0%} of the diameter, "
-            f"got one {max(offsets):.3g} mm off: move the mesh's origin (`make part` does)"
+            f"{where} must have a diameter, the largest vertex distance, between the longest side and the diagonal "
+            f"of its box, {max(sizes):g} and {math.hypot(*sizes):g}, got {diameter:g}: are both in millimetres?"
         )
-    turns = discrete[:, :3, :3]
-    if not continuous:
-        group = _closed(where, turns)
-        return Symmetry("group", quaternions=quaternion_from_matrix(group).tolist()) if len(group) > 1 else Symmetry()
-    axis = continuous[0][0] / np.linalg.norm(continuous[0][0])
-    cosines = np.array([*(np.dot(a, axis) / np.linalg.norm(a) for a, _ in continuous), *(turns @ axis @ axis)])
-    if (np.abs(cosines) < 0.999).any():
-        raise ValueError(f"{where} must have one axis of revolution, got others beside {axis.round(3).tolist()}")
-    return Symmetry("revolution", axis=tuple(axis.tolist()), flip=bool((turns @ axis @ axis < 0).any()))
+    if not SMALLEST <= diameter <= LARGEST:
+        looks = "metres" if diameter < SMALLEST else "micrometres"
+        raise ValueError(
+            f"{where} must have a diameter in millimetres, {SMALLEST:g} to {LARGEST:g}, got {diameter:g}: looks like "
+            f"{looks}"
+        )
+    return diameter
 
 
-def _closed(where: str, turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The group ``(G, 3, 3)`` that rotations ``(K, 3, 3)`` generate, identity first."""
-    group = [np.eye(3)]
-    pending = [_nearest_rotation(where, turn) for turn in turns]
-    while pending:
-        turn = pending.pop()
-        if min(float(np.abs(turn - member).max()) for member in group) < 1e-3:
-            continue
-        group.append(turn)
-        if len(group) > MOST_ROTATIONS:
-            raise ValueError(f"{where} must have a symmetry group of at most {MOST_ROTATIONS} rotations, got more")
-        pending += [product for member in group for product in (member @ turn, turn @ member)]
-    return np.array(group)
+def _model(where: str, entry: Mapping[str, Any]) -> BopModel:
+    diameter = _diameter(where, entry)
+    for key in entry:
+        if key.lower().startswith("symmetr") and key not in (DISCRETE, CONTINUOUS):
+            raise ValueError(f"{where} must have its symmetries under {DISCRETE} and {CONTINUOUS}, got {key!r}")
+    matrices = [_matrix(f"{where}: {DISCRETE}[{i}]", value) for i, value in enumerate(_list(where, entry, DISCRETE))]
+    axes = [_axis(f"{where}: {CONTINUOUS}[{i}]", value) for i, value in enumerate(_list(where, entry, CONTINUOUS))]
+    count = (1 + len(matrices)) * max(len(axes), 1)
+    if count > MOST_SYMMETRIES:
+        raise ValueError(f"{where} must have at most {MOST_SYMMETRIES} symmetries with the identity, got {count}")
+    discrete = np.array(matrices).reshape(-1, 4, 4)
+    group = nearest_group(where, discrete, axes, diameter)
+    if remarks := group.remarks(diameter):
+        log.warning(
+            "%s: its symmetries are %s; %s are taken, and only BOP's score goes by the file's own, as the toolkit does",
+            where, " and ".join(remarks), group.described,
+        )  # fmt: skip
+    discrete[:, :3, 3] /= 1000
+    continuous = tuple((axis, offset / 1000) for axis, offset in axes)
+    return BopModel(diameter / 1000, discrete, continuous, group.symmetry, group.center / 1000)
 
 
-def _nearest_rotation(where: str, turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    u, spread, vt = np.linalg.svd(turn)
-    if np.abs(spread - 1).max() > 0.01 or np.linalg.det(turn) < 0:
-        raise ValueError(f"{where} must have rotations as symmetries_discrete, got {turn.round(3).tolist()}")
-    return np.asarray(u @ vt)
+def _list(where: str, entry: Mapping[str, Any], key: str) -> list[Any]:
+    value = entry.get(key, [])
+    if not isinstance(value, list):
+        raise ValueError(f"{where}: {key} must be a list, got {value!r:.60}")
+    return value
+
+
+def _matrix(where: str, value: Any) -> NDArray[np.float64]:
+    """``(4, 4)``, millimetres."""
+    matrix = _numbers(where, {"it": value}, "it", 16, "16 finite numbers, a 4x4 matrix row by row").reshape(4, 4)
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        hint = ": looks like column by column" if np.abs(matrix[:, 3] - (0, 0, 0, 1)).max() < 1e-6 else ""
+        raise ValueError(
+            f"{where} must be a 4x4 matrix row by row with the last row 0 0 0 1, got {matrix[3].tolist()}{hint}"
+        )
+    rotation = matrix[:3, :3]
+    spread, determinant = np.linalg.svd(rotation, compute_uv=False), float(np.linalg.det(rotation))
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > ROTATION_ERROR or determinant < 0:
+        what = f"R R^T off from I by {error:.2g}"
+        if np.ptp(spread) < ROTATION_ERROR * spread.max() and spread.min() > 0:
+            what = f"one scaled by {spread.mean():.4g}" if determinant > 0 else "a mirror image, determinant -1"
+        raise ValueError(f"{where} must be a rotation (R R^T = I within {ROTATION_ERROR}, determinant +1), got {what}")
+    return matrix
+
+
+def _axis(where: str, value: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axis as it is, and offset in millimetres."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{where} must be a JSON object with axis and offset, got {value!r:.60}")
+    axis, offset = (_numbers(where, value, key, 3) for key in ("axis", "offset"))
+    if not np.linalg.norm(axis) > 1e-6:
+        raise ValueError(f"{where}: axis must have a direction, got {value['axis']}")
+    return axis, offset
+
+
+def _numbers(where: str, entry: Mapping[str, Any], key: str, count: int, wanted: str = "") -> NDArray[np.float64]:
+    """``(count,)`` finite numbers, in lists of lists too."""
+    if key not in entry:
+        raise ValueError(f"{where} must have {key}, got only {', '.join(entry) or 'nothing'}")
+    values = [entry[key]]
+    while any(isinstance(value, list) for value in values):
+        values = [inner for value in values for inner in (value if isinstance(value, list) else [value])]
+    are_numbers = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
+    if len(values) != count or not are_numbers or not all(abs(value) < 1e300 for value in values):
+        wanted = wanted or ("a finite number" if count == 1 else f"{count} finite numbers")
+        got = f"{len(values)} numbers" if are_numbers and len(values) != count else repr(entry[key])[:60]
+        raise ValueError(f"{where}{'' if key == 'it' else f': {key}'} must be {wanted}, got {got}")
+    return np.array(values, dtype=np.float64)

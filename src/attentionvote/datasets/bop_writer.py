@@ -1,18 +1,23 @@
-"""Writer of the BOP format: what ``bop.BopDataset`` and the BOP toolkit read."""
+"""Writer of the BOP format, scenes and models: what ``bop.BopDataset``, ``bop_models`` and the BOP toolkit read."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
 
 from attentionvote.datasets.bop import MISSING
+from attentionvote.datasets.bop_models import MODELS_INFO, read_models_info
 from attentionvote.datasets.depth_image import TOP, DepthCoding, PinholeCamera, write_image
 from attentionvote.files import write_whole
+from attentionvote.geometry.pose import transform
+from attentionvote.part import Part
 
 # Millimetres per count, the finest that holds the picture's depth is taken.
 DEPTH_SCALES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -106,9 +111,44 @@ class BopSceneWriter:
             write_whole(self._folder / f"scene_{name}.json", json.dumps(content, indent=1) + "\n")
 
 
+def write_models(folder: Path, parts: Mapping[int, Part]) -> None:
+    """Write ``models_info.json`` and a PLY in millimetres of every part, by object id.
+
+    Raises:
+        ValueError: with one sentence, when the reader would not take the models back.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    info = {}
+    for object_id, part in parts.items():
+        low, size = part.vertices.min(axis=0) * 1000, np.ptp(part.vertices, axis=0) * 1000
+        entry: dict[str, Any] = {
+            "diameter": float(pdist(part.vertices[ConvexHull(part.vertices).vertices]).max() * 1000)
+        }
+        entry |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
+        entry |= {f"size_{axis}": float(value) for axis, value in zip("xyz", size, strict=True)}
+        turns = part.symmetry.rotations()[1:]
+        if len(turns):
+            entry["symmetries_discrete"] = transform(turns, np.zeros(3)).reshape(-1, 16).tolist()
+        if part.symmetry.is_revolution:
+            entry["symmetries_continuous"] = [{"axis": list(part.symmetry.axis), "offset": [0, 0, 0]}]
+        info[str(object_id)] = entry
+        (folder / f"obj_{object_id:06d}.ply").write_text(_ply(part), encoding="ascii")
+    (folder / MODELS_INFO).write_text(json.dumps(info, indent=2) + "\n", encoding="utf-8")
+    read_models_info(folder / MODELS_INFO)
+
+
 def _box(mask: NDArray[np.bool_]) -> list[int]:
     """``x, y, width, height`` of a mask ``(H, W)`` in pixels, -1 without a pixel."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return [-1, -1, -1, -1]
     return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
+
+
+def _ply(part: Part) -> str:
+    head = ["ply", "format ascii 1.0", f"element vertex {len(part.vertices)}"]
+    head += [f"property float {axis}" for axis in "xyz"]
+    head += [f"element face {len(part.faces)}", "property list uchar int vertex_indices", "end_header"]
+    vertices = [" ".join(f"{value:.6g}" for value in vertex) for vertex in part.vertices * 1000]
+    faces = [f"3 {a} {b} {c}" for a, b, c in part.faces]
+    return "\n".join([*head, *vertices, *faces]) + "\n"

@@ -9,6 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from attentionvote.datasets.bop import BopDataset
+from attentionvote.datasets.bop_models import models_info_of, read_models_info
 from attentionvote.datasets.dataset import LEAST_DROPS, Dataset, Frame
 from attentionvote.datasets.ipa import IpaDataset
 from attentionvote.datasets.placement import Placement, PlacementCheck
@@ -63,7 +65,7 @@ def check_dataset(
         progress: called with the number of scenes done and the number to do.
     """
     where = f"{dataset.title}, {dataset.split}"
-    findings = _of_counts(dataset, where)
+    findings = _of_counts(dataset, where) + _of_models(dataset)
     lacking = _of_files(dataset, where, findings)
     last = len(dataset.names) - 1
     opened_indices = sorted({round(share * last) for share in 1 - np.linspace(0, 1, most_scenes)}) if last >= 0 else []
@@ -143,6 +145,17 @@ def _of_counts(dataset: Dataset, where: str) -> list[Finding]:
         )
     findings = [Finding("warning", f"{where}: {sentence}") for sentence in warnings]
     return findings + (_of_cycles(dataset, where) if isinstance(dataset, IpaDataset) and paper_set else [])
+
+
+def _of_models(dataset: Dataset) -> list[Finding]:
+    """What a dataset's models say of themselves; their diameters were read when it was opened."""
+    info = models_info_of(dataset.directory) if isinstance(dataset, BopDataset) else None
+    try:
+        if info is not None:
+            read_models_info(info)
+    except ValueError as error:
+        return [Finding("error", " ".join(str(error).split()))]
+    return []
 
 
 def _of_cycles(dataset: IpaDataset, where: str) -> list[Finding]:

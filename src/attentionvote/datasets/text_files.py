@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,29 @@ def read_json(path: Path, kind: type) -> Any:
     """The content of a JSON file that holds a ``kind`` (dict or list).
 
     Raises:
-        ValueError: with one sentence, when it is missing, not JSON or something else.
+        ValueError: with one sentence, when it is missing, not JSON, something else, or says something twice.
     """
+    text = read_text(path)
     try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
+        content = json.loads(text, object_pairs_hook=_each_once)
+    except _Repeated as error:
+        raise ValueError(f"{path}: {error}") from None
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: the file must be JSON, got {error}") from error
     if not isinstance(content, kind):
         raise ValueError(f"{path}: the file must hold a JSON {kind.__name__}, got {type(content).__name__}")
+    return content
+
+
+class _Repeated(ValueError):
+    """An object has a key more than once."""
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        key, count = Counter(key for key, _ in pairs).most_common(1)[0]
+        raise _Repeated(f"a JSON object must have every key once, got {key!r} {count} times")
     return content
 
 

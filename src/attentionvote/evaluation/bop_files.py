@@ -1,4 +1,4 @@
-"""BOP's files (docs/bop_datasets_format.md of the BOP toolkit): result CSVs, ground truth of a split, model facts.
+"""BOP's files (docs/bop_datasets_format.md of the BOP toolkit): result CSVs, ground truth of a split, targets.
 
 On disk lengths are millimetres; everything here is in metres.
 """
@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.evaluation.mssd import symmetry_transforms
 from attentionvote.evaluation.result_files import read_json
 from attentionvote.evaluation.scene_result import Array
 from attentionvote.geometry.pose import rotation_problem, transform
@@ -42,13 +41,6 @@ class BopPoses(NamedTuple):
     objects: Ids
     poses: Array
     values: Array
-
-
-class BopModel(NamedTuple):
-    """Facts of ``models_info.json``: ``diameter`` in metres (largest vertex distance), symmetries ``(S, 4, 4)``."""
-
-    diameter: float
-    symmetries: Array
 
 
 def parse_name(path: str | Path) -> BopName:
@@ -165,31 +157,6 @@ def read_targets(path: str | Path) -> set[Image]:
     ):
         raise ValueError(f"{path}: the file must hold a list of objects with scene_id and im_id")
     return {(int(entry["scene_id"]), int(entry["im_id"])) for entry in content}
-
-
-def read_models_info(path: str | Path) -> dict[int, BopModel]:
-    """Diameter and symmetries of every model in ``models_info.json``, by object number.
-
-    Raises:
-        ValueError: with one sentence naming the object and the rule.
-    """
-    models = {}
-    for key, entry in _object(path).items():
-        where = f"{path}: object {key}"
-        diameter = float(_array(where, entry, "diameter", 1)[0]) / 1000
-        if diameter <= 0:
-            raise ValueError(f"{where} must have a positive diameter, got {entry['diameter']}")
-        discrete = np.array([_array(where, {"symmetries_discrete": s}, "symmetries_discrete", 16).reshape(4, 4)
-                             for s in entry.get("symmetries_discrete", [])]).reshape(-1, 4, 4)  # fmt: skip
-        if problem := rotation_problem(discrete[:, :3, :3]):
-            raise ValueError(f"{where}: symmetries_discrete[{problem[0]}] {problem[1]}")
-        discrete[:, :3, 3] /= 1000
-        continuous = [
-            (_array(where, s, "axis", 3), _array(where, s, "offset", 3) / 1000)
-            for s in entry.get("symmetries_continuous", [])
-        ]
-        models[int(key)] = BopModel(diameter, symmetry_transforms(discrete, continuous))
-    return models
 
 
 def _seconds_an_image(path: str | Path, lines: list[int], images: Ids, times: Array) -> float | None:

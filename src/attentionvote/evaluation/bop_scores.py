@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.evaluation.bop_files import BopModel, BopPoses, Image
+from attentionvote.evaluation.bop_files import BopPoses, Image
 from attentionvote.evaluation.coco_precision import ImageErrors, coco_precision
 from attentionvote.evaluation.mssd import SurfaceDistance
 from attentionvote.evaluation.result_files import unit_problem
@@ -24,6 +25,17 @@ LENGTHS_MM = np.arange(2.0, 21.0, 2.0)
 LEAST_VISIBLE = 0.1
 RESULT_LIMIT = 100
 RESULT_LIMITS = {"xyzibd": 200}  # data sets with a limit of their own
+
+
+class ScoredModel(NamedTuple):
+    """Facts of a model: ``diameter`` in metres (largest vertex distance), ``symmetries`` ``(S, 4, 4)`` in metres.
+
+    The symmetries are ``mssd.symmetry_transforms`` of the file's own numbers, also where those are nearly but not quite
+    a group (LINEMOD's eggbox and glue): the toolkit takes them as they are, and a figure is to be the toolkit's.
+    """
+
+    diameter: float
+    symmetries: Array
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ def bop_scores(
     estimates: BopPoses,
     truth: BopPoses,
     images: Sequence[Image],
-    models: Mapping[int, BopModel],
+    models: Mapping[int, ScoredModel],
     vertices: Mapping[int, Array],
     result_limit: int = RESULT_LIMIT,
 ) -> BopScores:
@@ -130,7 +142,7 @@ def _within_limit(estimates: BopPoses, limit: int) -> BopPoses:
 
 
 def _errors(
-    estimates: BopPoses, truth: BopPoses, models: Mapping[int, BopModel], vertices: Mapping[int, Array]
+    estimates: BopPoses, truth: BopPoses, models: Mapping[int, ScoredModel], vertices: Mapping[int, Array]
 ) -> tuple[dict[int, list[ImageErrors]], int]:
     """MSSD in metres of every object in every image it occurs in, and the number of results of other objects."""
     by_object: dict[int, list[ImageErrors]] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.geometry.nearest_symmetry import exact_group
 from attentionvote.geometry.pose import quaternion_from_matrix, rotation_about
 from attentionvote.simulation.surface_distance import RotationCheck
 
@@ -78,31 +79,6 @@ def closure(generators: Array) -> Array | None:
             return None
         queue += [r @ e for e in elements] + [e @ r for e in elements]
     return exact_group(np.stack(elements))
-
-
-def exact_group(elements: Array, rounds: int = 6) -> Array:
-    """Remove the rounding from an approximate group ``(G, 3, 3)``.
-
-    Each element becomes the mean of all the products that should equal it; this converges quadratically
-    to a true group (Grove, Karcher and Ruh 1974).
-    """
-    group = elements
-    products = np.einsum("aji,bjk->abik", group, group)  # inverse(a) @ b
-    table = np.linalg.norm(products[:, :, None] - group[None, None], axis=(-2, -1)).argmin(-1)
-    for _ in range(rounds):
-        # g[table[a, b]] should equal inverse(g[a]) @ g[b].
-        mean = np.zeros_like(group)
-        np.add.at(mean, table, np.einsum("aji,bjk->abik", group, group))
-        left, _, right = np.linalg.svd(mean)
-        group = left @ right
-    return _snapped(group)
-
-
-def _snapped(group: Array) -> Array:
-    """The group with its numbers exact when it is a cube's or a tetrahedron's in line with the axes."""
-    rounded = np.round(group)
-    is_close = np.abs(group - rounded).max() < 2e-3
-    return rounded if is_close else group
 
 
 def quaternions_of(group: Array) -> list[tuple[float, ...]]:

@@ -141,7 +141,8 @@ def write_bop_models(folder: Path, parts: Parts) -> None:
     Raises:
         ValueError: when the folder holds models of other parts.
     """
-    from attentionvote.datasets.bop_models import MODELS_INFO, write_models
+    from attentionvote.datasets.bop_models import MODELS_INFO
+    from attentionvote.datasets.bop_writer import write_models
 
     temporary, target = folder / f".models.{os.getpid()}", folder / "models"
     try:

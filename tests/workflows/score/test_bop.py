@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 import score
-from bop_split import HEADER, BopSplit, csv_row
+from bop_split import HEADER, BopSplit, csv_row, write_ply
 
 from attentionvote.command.configuration import compose
 from attentionvote.command.errors import ConfigurationError
@@ -88,6 +88,18 @@ def test_impossible_requests_are_one_sentence(bop_split: BopSplit, change: list[
         run(bop_split, *change)
 
 
+def test_symmetries_that_are_none_are_one_sentence(bop_split: BopSplit) -> None:
+    path = bop_split.models / "models_info.json"
+    infos = json.loads(path.read_text())
+    infos["7"]["symmetries_continuous"][0]["axis"] = [0, 0, 0]
+    path.write_text(json.dumps(infos))
+    with pytest.raises(ConfigurationError, match=r"object 7: sym.*\[0\]: axis must have a direction, got \[0, 0, 0\]"):
+        run(bop_split)
+    path.write_text(json.dumps(infos).replace('"7"', '"05"'))
+    with pytest.raises(ConfigurationError, match="got '05': it is there beside '5', which is the same object"):
+        run(bop_split)
+
+
 def test_files_that_cannot_be_scored_are_one_sentence(bop_split: BopSplit) -> None:
     targets = bop_split.root / "targets.json"
     targets.write_text(json.dumps([{"scene_id": 1, "im_id": 5}]))
@@ -104,6 +116,9 @@ def test_files_that_cannot_be_scored_are_one_sentence(bop_split: BopSplit) -> No
     model = bop_split.models / "obj_000005.ply"
     model.write_text("solid")
     with pytest.raises(ConfigurationError, match=r"obj_000005\.ply: the model cannot be read, its header"):
+        run(bop_split)
+    write_ply(model, np.eye(3) * 0.07)
+    with pytest.raises(ConfigurationError, match=r"000005\.ply: the model must be as large as its diameter in mod"):
         run(bop_split)
     model.unlink()
     with pytest.raises(ConfigurationError, match=r"obj_000005\.ply: the model cannot be read \(No such file"):
