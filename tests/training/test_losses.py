@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,9 +18,9 @@ from attentionvote.model.neighborhoods import find_neighborhoods
 from attentionvote.model.network import AttentionVote
 from attentionvote.model.predictions import Poses, Votes
 from attentionvote.model.proposals import Peaks
-from attentionvote.part import Part
+from attentionvote.part import Part, PartSet
 from attentionvote.training.losses import Assignment, AttentionVoteLoss, masked_mean
-from attentionvote.training.settings import LossSettings
+from attentionvote.training.settings import LossSettings, check_isotropic
 from attentionvote.training.step import batch_loss
 
 WEIGHTS = dict.fromkeys(AttentionVoteLoss.TERMS, 1.0)
@@ -154,6 +155,25 @@ def test_one_class_has_no_semantic_term(make_box: Callable, batch: Batch, assign
     poses = poses_of(*near_truth(batch, assigned, 0))
     terms = AttentionVoteLoss(make_box(), WEIGHTS, LossSettings()).proposal_terms(poses, assigned, batch)
     assert terms.keys() == {"center", "rotation"}
+
+
+def test_a_body_of_revolution_refuses_a_share_of_d_that_it_would_ignore(make_box: Callable) -> None:
+    gear, bolt, box = make_box(Symmetry("revolution")), make_box(Symmetry("revolution", flip=True)), make_box()
+    sentence = (
+        r"^loss\.settings\.isotropic must be left at 0\.1 or be 0 for box, a body of revolution, which it does not "
+        r"change: there is no Lambda that it could be added to, got 0\.3$"
+    )
+    with pytest.raises(ValueError, match=sentence):
+        AttentionVoteLoss(gear, WEIGHTS, LossSettings(isotropic=0.3))
+    tables = [
+        AttentionVoteLoss(gear, WEIGHTS, LossSettings(isotropic=share)).training_pose.each[0].representation
+        for share in (0.0, LossSettings().isotropic)
+    ]
+    torch.testing.assert_close(*tables, rtol=0, atol=0)
+    check_isotropic(LossSettings(isotropic=0.3), box)
+    check_isotropic(LossSettings(isotropic=0.3), PartSet("mixed", (gear, replace(box, name="other"))))
+    with pytest.raises(ValueError, match="for round, a set of bodies of revolution, which"):
+        check_isotropic(LossSettings(isotropic=0.05), PartSet("round", (gear, replace(bolt, name="bolt"))))
 
 
 def test_refined_term_is_the_evaluations_distance_in_tenths_of_the_diameter(

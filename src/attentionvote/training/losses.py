@@ -20,7 +20,7 @@ from attentionvote.model.proposals import Peaks
 from attentionvote.part import Parts
 from attentionvote.training.part_poses import PartPoses
 from attentionvote.training.processes import summed
-from attentionvote.training.settings import LossSettings
+from attentionvote.training.settings import LossSettings, check_isotropic
 
 QUALITY_STEPS = (0.02, 0.05, 0.10)  # of D: the thresholds of the evaluation
 _QUALITY_STEPS = Constant(torch.tensor(QUALITY_STEPS, dtype=torch.float64))
@@ -52,6 +52,9 @@ class AttentionVoteLoss:
             rotation), ``center``, ``rotation``, ``semantic`` (Eq. 9), ``confidence`` (Eq. 10), ``refined`` (pose
             after the refinement, mean over its steps). A weight of 0 leaves a term out.
         settings: the choices.
+
+    Raises:
+        ValueError: with one sentence, on the weight of an unknown term, or a setting that the part has no use for.
     """
 
     TERMS = ("vote", "vote_rotation", "center", "rotation", "semantic", "confidence", "refined")
@@ -60,6 +63,7 @@ class AttentionVoteLoss:
         unknown = sorted(set(weights) - set(self.TERMS))
         if unknown:
             raise ValueError(f"loss weights must be among {', '.join(self.TERMS)}, got {', '.join(unknown)}")
+        check_isotropic(settings, part)
         self.weights, self.settings = dict(weights), settings
         self.training_pose = PartPoses.of(part, settings.isotropic)
         self.true_pose = PartPoses.of(part)

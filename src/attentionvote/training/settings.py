@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from attentionvote.section import check
 from attentionvote.setting import Identity, Setting
 from attentionvote.training.schedule import Schedule
+
+if TYPE_CHECKING:
+    from attentionvote.part import Parts
 
 CHANGED = Identity.CHANGED
 
@@ -25,6 +28,7 @@ LIMIT = Setting(
     identity=CHANGED,
     problem=_no_share,
 )
+ISOTROPIC = 0.1  # what every part's settings hold; only another value is known to be somebody's choice
 RotationLoss = Literal["metric", "slerp", "minra", "nlerp"]
 
 
@@ -50,9 +54,10 @@ class LossSettings:
     """
 
     rotation: Annotated[RotationLoss, Setting("Distance of rotations, see training/pose_loss.py.")] = "metric"
-    isotropic: Annotated[float, Setting("Share of D added to Lambda in the metric rotation loss.", low=0, high=10)] = (
-        0.1
-    )
+    isotropic: Annotated[
+        float,
+        Setting("Share of D added to Lambda in the metric rotation loss, not of bodies of revolution.", low=0, high=10),
+    ] = ISOTROPIC
     assignment: Annotated[
         float, Setting("Share of D within which a centre seed belongs to an instance.", above=0, high=10)
     ] = 0.2
@@ -74,6 +79,21 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         check(self)
+
+
+def check_isotropic(settings: LossSettings, parts: Parts) -> None:
+    """Refuse a share of D chosen for bodies of revolution alone: one axis and its length are all that they have.
+
+    Raises:
+        ValueError: with one sentence, when it is neither 0 nor the default that is there for every part.
+    """
+    if settings.isotropic in (0, ISOTROPIC) or not all(part.symmetry.is_revolution for part in parts.parts):
+        return
+    what = "a body" if len(parts.parts) == 1 else "a set of bodies"
+    raise ValueError(
+        f"loss.settings.isotropic must be left at {ISOTROPIC} or be 0 for {parts.name}, {what} of revolution, which it "
+        f"does not change: there is no Lambda that it could be added to, got {settings.isotropic:g}"
+    )
 
 
 @dataclass(frozen=True)

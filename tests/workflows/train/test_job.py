@@ -128,6 +128,10 @@ def leftovers(folder: Path) -> list[str]:
         ),
         (["object=bunny", "object.mesh=nowhere/bunny.obj"], "object bunny: mesh .* 'nowhere/bunny.obj'"),
         (["object=brick", "data.points=100"], r"data.points must be at least model.centers\[0\] \(512\), got 100"),
+        (
+            ["object=gear", "loss.settings.isotropic=0.3"],
+            "object gear: loss.settings.isotropic must be left at 0.1 or be 0 for gear, a body of revolution",
+        ),
         (["object=brick", "tracking.store=http//x"], "tracking store must be .*'http//x'"),
         (["object=brick", "outputs=/proc/self/environ/x"], "outputs=/proc/self/environ/x cannot be written: "),
     ],

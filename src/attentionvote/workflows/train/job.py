@@ -17,6 +17,7 @@ from attentionvote.command.identity import identity
 from attentionvote.files import locked_folder, read_json
 from attentionvote.part import Parts, only_part
 from attentionvote.simulation.scene_spec import SceneSetSpec, scene_set_specs
+from attentionvote.training.settings import check_isotropic
 from attentionvote.workflows.train.beginning import MODEL, origin
 from attentionvote.workflows.train.network import check_classes
 from attentionvote.workflows.train.precision import CPU_PRECISION, resolved_precision
@@ -97,6 +98,7 @@ def find_training(cfg: TrainSettings, gpu: bool | None = None) -> TrainingJob:
     part: Parts = cfg.object()
     specs = scene_set_specs(part, cfg.simulation)
     check_classes(cfg.model.classes, part)
+    check_isotropic(cfg.loss.settings, part)
     for split in ("train", "val", "test"):
         if split not in specs:
             raise ValueError(f"simulation.cycles must have train, val and test, got {', '.join(specs)}")
