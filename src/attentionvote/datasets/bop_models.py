@@ -33,6 +33,7 @@ SMALLEST, LARGEST = 1.0, 10_000.0
 SLACK = 2.0
 # Of R R^T from I: three digits make 0.002, two make 0.02.
 ROTATION_ERROR = 0.005
+MOST_NUMBER = 1e9  # no length in millimetres and no direction needs more, nor is NaN or infinity less
 DISCRETE, CONTINUOUS = "symmetries_discrete", "symmetries_continuous"
 
 
@@ -159,7 +160,7 @@ def _list(where: str, entry: Mapping[str, Any], key: str) -> list[Any]:
 
 def _matrix(where: str, value: Any) -> NDArray[np.float64]:
     """``(4, 4)``, millimetres."""
-    matrix = _numbers(where, {"it": value}, "it", 16, "16 finite numbers, a 4x4 matrix row by row").reshape(4, 4)
+    matrix = _numbers(where, {"it": value}, "it", 16, "a 4x4 matrix row by row, 16 numbers").reshape(4, 4)
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         hint = ": looks like column by column" if np.abs(matrix[:, 3] - (0, 0, 0, 1)).max() < 1e-6 else ""
         raise ValueError(
@@ -187,15 +188,17 @@ def _axis(where: str, value: Any) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _numbers(where: str, entry: Mapping[str, Any], key: str, count: int, wanted: str = "") -> NDArray[np.float64]:
-    """``(count,)`` finite numbers, in lists of lists too."""
+    """``(count,)`` numbers, in lists of lists too."""
     if key not in entry:
-        raise ValueError(f"{where} must have {key}, got only {', '.join(entry) or 'nothing'}")
+        others = " ".join(", ".join(entry).split())[:60] or "nothing"
+        raise ValueError(f"{where} must have {key}, got only {others}")
     values = [entry[key]]
-    while any(isinstance(value, list) for value in values):
+    while count > 1 and any(isinstance(value, list) for value in values):
         values = [inner for value in values for inner in (value if isinstance(value, list) else [value])]
     are_numbers = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    if len(values) != count or not are_numbers or not all(abs(value) < 1e300 for value in values):
-        wanted = wanted or ("a finite number" if count == 1 else f"{count} finite numbers")
+    if len(values) != count or not are_numbers or not all(abs(value) <= MOST_NUMBER for value in values):
+        wanted = wanted or ("a number" if count == 1 else f"{count} numbers")
         got = f"{len(values)} numbers" if are_numbers and len(values) != count else repr(entry[key])[:60]
-        raise ValueError(f"{where}{'' if key == 'it' else f': {key}'} must be {wanted}, got {got}")
+        name = "" if key == "it" else f": {key}"
+        raise ValueError(f"{where}{name} must be {wanted} within +-1e9, got {got}")
     return np.array(values, dtype=np.float64)

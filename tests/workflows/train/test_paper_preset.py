@@ -1,4 +1,4 @@
-"""What experiment=paper does otherwise than the paper: declared in docs/variants.md, true in conf, taken back as said."""
+"""What experiment=paper does otherwise than the paper: declared in docs/variants.md, so in conf, taken back as said."""
 
 from __future__ import annotations
 
@@ -27,9 +27,8 @@ def departures() -> list[list[str]]:
 
 def words(row: list[str]) -> list[str]:
     """The settings that take a departure back."""
-    return [
-        word for text in re.findall(r"`([^`]+)`", row[3]) for word in text.split() if "=" in word and "DIR" not in word
-    ]
+    said = [word for text in re.findall(r"`([^`]+)`", row[3]) for word in text.split()]
+    return [word for word in said if "=" in word and "DIR" not in word]
 
 
 WITH_SETTING = [row for row in departures() if words(row)]
@@ -41,6 +40,8 @@ def test_a_departure_is_taken_back_by_the_settings_that_it_names(row: list[str])
     for word in words(row):
         taken_back = compose(TrainSettings, [*PAPER, word]).composed
         assert taken_back != paper, word
+    together = compose(TrainSettings, [*PAPER, *words(row)])
+    assert together.data.points <= together.data.pool <= together.data.density
 
 
 def test_the_declared_departures_are_those_of_the_preset() -> None:
