@@ -38,7 +38,7 @@ class PoseTraining(L.LightningModule):
         loss: its losses; None of a loaded module, which only answers (so the next two).
         part: for the metrics; or the set of parts that the network's classes are.
         schedule: learning rate and warm-up.
-        optimizer: ``adam`` (the paper's), ``adamw`` or another.
+        optimizer: ``adam`` (the paper's), ``adamw``, ``muon`` or another.
         learning_rate, weight_decay: of the optimiser.
         rate_schedule: learning rate instead of the schedule's.
         peak_threshold: heat a proposal needs to count at validation (paper: 0.4).

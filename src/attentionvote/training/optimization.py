@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from attentionvote.section import Factory
+from attentionvote.training.muon import Muon
 from attentionvote.training.schedule import Schedule
 
 
@@ -19,7 +20,8 @@ def optimizer_of(
     """An optimizer over weights; biases and norms do not decay.
 
     Args:
-        kind: ``adam`` (the paper's), ``adamw``, or what a ``_target_`` names; its own ``lr`` and ``weight_decay`` win.
+        kind: ``adam`` (the paper's), ``adamw``, ``muon`` (``training.muon``), or what a ``_target_`` names; its own
+            ``lr`` and ``weight_decay`` win.
         weights: all.
         rate: learning rate.
         decay: of the weights.
@@ -31,6 +33,8 @@ def optimizer_of(
     everything = list(weights)
     decayed = [p for p in everything if p.ndim > 1]
     plain = [p for p in everything if p.ndim <= 1]
+    if kind == "muon":
+        return Muon(everything, lr=rate, weight_decay=decay)
     if isinstance(kind, str):
         groups = [{"params": decayed, "weight_decay": decay}, {"params": plain, "weight_decay": 0.0}]
         adam = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[kind]

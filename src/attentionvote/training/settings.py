@@ -110,7 +110,7 @@ class TrainerSettings:
 
     max_epochs: Annotated[int, Setting("Epochs of the training.", low=1, high=1_000_000)]
     batch_size: Annotated[int, Setting("Scenes of a batch, of all processes together.", low=1, high=100_000)]
-    optimizer: Annotated[str, Setting("Of torch.", choices=("adam", "adamw"))]
+    optimizer: Annotated[str, Setting("Torch's, or muon: see training/muon.py.", choices=("adam", "adamw", "muon"))]
     learning_rate: Annotated[float, Setting("At its highest, see schedule.", above=0, high=10)]
     weight_decay: Annotated[float, Setting("Of the optimizer.", low=0, high=10)]
     gradient_clip: Annotated[float, Setting("Largest norm of the gradient; 0 = not clipped.", low=0, high=1e6)]

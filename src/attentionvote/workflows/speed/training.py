@@ -15,6 +15,7 @@ from attentionvote.model.backbone import SetAbstraction
 from attentionvote.model.point_features import CHANNELS, pair_features_reference
 from attentionvote.model.pooled_mlp import pooled_mlp, pooled_mlp_reference
 from attentionvote.training.losses import AttentionVoteLoss
+from attentionvote.training.optimization import optimizer_of
 from attentionvote.training.step import batch_loss
 from attentionvote.workflows.speed.contest import Contest, Unequal
 from attentionvote.workflows.speed.data import slowly
@@ -108,9 +109,8 @@ def step(material: Material, size: str) -> Contest:
 
     def contestant() -> Callable[[], Answer]:
         model = copy.deepcopy(material.network(size)).train()
-        kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[cfg.trainer.optimizer]
         # A rate of 0: every round is the same step.
-        optimizer = kind(model.parameters(), lr=0.0, fused=True)
+        optimizer = optimizer_of(cfg.trainer.optimizer, model.parameters(), 0.0, 0.0, fused=True)
 
         def run() -> Answer:
             optimizer.zero_grad()
