@@ -67,7 +67,7 @@ def test_a_set_holds_what_its_specification_says(bracket: Part, tmp_path: Path) 
 
 def test_what_a_thinned_set_keeps_is_as_in_the_full_one(bracket: Part, tmp_path: Path) -> None:
     full = make_spec(bracket, drop_counts=(1, 2, 3, 4))
-    thin = replace(full, keep_every=3)
+    thin, low = replace(full, keep_every=3), replace(full, pile_share=0.5)
     everything = {
         (r.cycle, r.drop_count): r for r in generate_scene_set(bracket, full, tmp_path / "full", progress=False)
     }
@@ -75,7 +75,9 @@ def test_what_a_thinned_set_keeps_is_as_in_the_full_one(bracket: Part, tmp_path:
     places = [(0, 1), (0, 4), (1, 2), (2, 3), (3, 1), (3, 4)]
     assert [(r.cycle, r.drop_count) for r in scenes] == places
     assert (len(scenes), list(scenes.cycle_of_scene)) == (thin.scenes, [0, 0, 1, 2, 3, 3])
-    for r in scenes:
+    low_scenes = generate_scene_set(bracket, low, tmp_path / "low", progress=False)
+    assert [(r.cycle, r.drop_count) for r in low_scenes] == [(cycle, count) for cycle in range(4) for count in (1, 2)]
+    for r in [*scenes, *low_scenes]:
         same = everything[r.cycle, r.drop_count]
         np.testing.assert_array_equal(r.camera_from_part, same.camera_from_part)
         np.testing.assert_array_equal(r.camera_from_bin, same.camera_from_bin)

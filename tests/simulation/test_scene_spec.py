@@ -28,6 +28,7 @@ OTHERS = {
     "visibility_stride": 3,
     "format_version": 2,
     "keep_every": 2,
+    "pile_share": 0.5,
 }
 
 
@@ -60,6 +61,15 @@ def test_cycles_in_turn_keep_all_counts_between_them() -> None:
     assert (SPEC.counts_of(4), SPEC.scenes) == (counts, 130)
 
 
+def test_a_cycle_ends_at_its_share_of_the_drops() -> None:
+    low = replace(SPEC, pile_share=0.43)
+    assert low.counts_of(3) == (6, 8, 10, 12)
+    assert low.scenes == 40
+    assert [replace(low, keep_every=3).counts_of(cycle) for cycle in (0, 1, 2)] == [(6, 12), (8,), (10,)]
+    assert replace(SPEC, pile_share=0.4).counts_of(0)[-1] == 12  # 12 of 30 drops
+    assert replace(SPEC, pile_share=0.1).counts_of(0) == (6,)  # at least one
+
+
 def test_cycles_of_all_splits_have_their_own_seeds() -> None:
     words = {
         tuple(replace(SPEC, split=split, seed=seed).cycle_seed(cycle).generate_state(4))
@@ -87,6 +97,7 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
         "drop": {"friction": [0.3, 0.3]},
         "visibility_stride": 4,
         "keep_every": {"test": 2},
+        "pile_share": {"train": 0.75},
     }
     specs = scene_set_specs(bracket, read(SimulationSettings, settings))
     assert specs["test"] == SceneSetSpec(
@@ -94,6 +105,7 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
         DropSettings(friction=(0.3, 0.3)), 4, keep_every=2,
     )  # fmt: skip
     assert (specs["train"].cycles, specs["train"].keep_every, set(specs)) == (5, 1, {"train", "test"})
+    assert (specs["train"].pile_share, specs["train"].counts_of(0)) == (0.75, (2,))
     assert settings["seed"] == 3
     assert settings["camera"]["camera"] == {"width": 640, "height": 480}  # type: ignore[index]
     with pytest.raises(SettingError, match=r"^there is no setting 'dorp', did you mean 'drop'"):
@@ -112,6 +124,7 @@ def test_specifications_of_the_splits_from_plain_settings(bracket: Part) -> None
         ({"drop_counts": (0, 5)}, "drop_counts must be increasing numbers within 1..200, got"),
         ({"visibility_stride": 9}, "visibility_stride must lie in 1..8, got 9"),
         ({"keep_every": 0}, "keep_every must be at least 1, got 0"),
+        ({"pile_share": 0.0}, "pile_share must be above 0 and at most 1, got 0.0"),
     ],
 )
 def test_impossible_specifications(change: dict, message: str) -> None:

@@ -43,6 +43,15 @@ class SimulationSettings:
             identity=Identity.CHANGED,
         ),
     ] = field(default_factory=dict)
+    pile_share: Annotated[
+        dict[str, float],
+        Setting(
+            "Per split: a cycle ends at this share of the largest of drop_counts; splits not named go to the end.",
+            above=0,
+            high=1,
+            identity=Identity.CHANGED,
+        ),
+    ] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -60,6 +69,8 @@ class SceneSetSpec:
         keep_every: a cycle keeps every so-many-th of ``drop_counts``, at least one, see ``counts_of``; 1 keeps all.
             Consecutive piles of a cycle are nearly one picture, so as many scenes of more cycles say more. What is kept
             is as it would be in the full cycle.
+        pile_share: no pile of more than this share of the last of ``drop_counts``, but at least one. The bin has the
+            size of the full cycle. Of a cycle of 30 drops the last eight take half of the time.
 
     Raises:
         ValueError: when a setting is impossible.
@@ -76,6 +87,7 @@ class SceneSetSpec:
     visibility_stride: int = 2
     format_version: int = FORMAT_VERSION
     keep_every: int = 1
+    pile_share: float = 1.0
 
     def __post_init__(self) -> None:
         counts = tuple(int(c) for c in self.drop_counts)
@@ -92,12 +104,15 @@ class SceneSetSpec:
             raise ValueError(f"visibility_stride must lie in 1..8, got {self.visibility_stride}")
         if self.keep_every < 1:
             raise ValueError(f"keep_every must be at least 1, got {self.keep_every}")
+        if not 0 < self.pile_share <= 1:
+            raise ValueError(f"pile_share must be above 0 and at most 1, got {self.pile_share}")
 
     def counts_of(self, cycle: int) -> tuple[int, ...]:
         """After which drops a cycle's pile is kept: cycle 0 begins with the first of ``drop_counts``, cycle 1 with the
         second, and so on in turn, so that ``keep_every`` cycles have all of them between them."""
-        first = cycle % min(self.keep_every, len(self.drop_counts))
-        return self.drop_counts[first :: self.keep_every]
+        low = sum(count <= self.pile_share * self.drop_counts[-1] for count in self.drop_counts)
+        counts = self.drop_counts[: max(1, low)]
+        return counts[cycle % min(self.keep_every, len(counts)) :: self.keep_every]
 
     @property
     def scenes(self) -> int:
@@ -105,11 +120,12 @@ class SceneSetSpec:
         return sum(len(self.counts_of(cycle)) for cycle in range(self.cycles))
 
     def as_dict(self) -> dict:
-        """Plain JSON values, as written into the manifest; ``keep_every`` only where it keeps less than all, so that
-        digests of before it came are the same."""
+        """Plain JSON values, as written into the manifest; ``keep_every`` and ``pile_share`` only where they keep less
+        than all, so that digests of before they came are the same."""
         plain: dict = json.loads(json.dumps(asdict(self)))
-        if self.keep_every == 1:
-            del plain["keep_every"]
+        for name in ("keep_every", "pile_share"):
+            if plain[name] == 1:
+                del plain[name]
         return plain
 
     def digest(self) -> str:
@@ -140,6 +156,9 @@ def scene_set_specs(part: Parts, settings: SimulationSettings) -> dict[str, Scen
     s = settings
     shared = s.seed, s.drop_counts, s.bin, s.camera, s.drop, s.visibility_stride
     return {
-        split: SceneSetSpec(part.digest, split, cycles, *shared, keep_every=s.keep_every.get(split, 1))
+        split: SceneSetSpec(
+            part.digest, split, cycles, *shared,
+            keep_every=s.keep_every.get(split, 1), pile_share=s.pile_share.get(split, 1.0),
+        )
         for split, cycles in s.cycles.items()
-    }
+    }  # fmt: skip
