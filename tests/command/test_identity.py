@@ -50,15 +50,16 @@ def test_a_setting_says_whether_it_identifies() -> None:
         assert not identifies(TrainSettings, name)
 
 
-# The whole cycles of a test of before.
-WHOLE = "~simulation.keep_every.test"
+# The scenes, the network and the optimizer of before.
+WHOLE = "~simulation.keep_every.test ~simulation.pile_share.train model.test_voting_share=1.0"
+BEFORE = f"trainer=adamw simulation.cycles.test=10 {WHOLE}"
 # Folders of trainings, computed by commit 11bac4c, before settings said whether they identify.
 OF_BEFORE = {
-    f"object=brick simulation.cycles.test=10 {WHOLE}": "07c4fb994275",
-    f"object=connecting_rod experiment=votenet seed=3 simulation.cycles.test=10 {WHOLE}": "d6be5de89287",
-    f"object=industrial simulation.cycles.test=10 {WHOLE}": "7a3258f24b86",
+    f"object=brick {BEFORE}": "07c4fb994275",
+    f"object=connecting_rod experiment=votenet seed=3 {BEFORE}": "d6be5de89287",
+    f"object=industrial {BEFORE}": "7a3258f24b86",
     f"object=gear experiment=smoke trainer.log_every_steps=7 {WHOLE}": "c66d0b8f1658",
-    f"object=gear object.title=x simulation.cycles.test=10 {WHOLE}": "0eac54870e3d",
+    f"object=gear object.title=x {BEFORE}": "0eac54870e3d",
 }
 
 

@@ -146,6 +146,9 @@ def test_proposals_teach_the_votes_through_offsets_and_features_but_not_through_
 def test_voting_radius_may_be_set_during_training(make_network: Callable) -> None:
     assert make_network().voting_radius == pytest.approx(0.02)
     assert make_network(voting_radius=0.05).voting_radius == 0.05
+    assert make_network().test_voting_radius is None
+    assert make_network(voting_radius=0.05, test_voting_share=0.5).test_voting_radius == pytest.approx(0.025)
+    assert make_network(test_voting_radius=0.03, test_voting_share=0.5).test_voting_radius == 0.03
     assert make_network(base_radius=0.01).layout.radii == pytest.approx((0.01, 0.02, 0.03, 0.06))
 
 

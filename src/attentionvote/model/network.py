@@ -73,7 +73,8 @@ class AttentionVote(nn.Module):
 
     Attributes:
         voting_radius: in which votes are gathered, metres; may be set during training.
-        test_voting_radius: the same outside training (Table 9); None takes ``voting_radius``.
+        test_voting_radius: the same outside training (Table 9); None takes ``voting_radius``. Training gathers widely,
+            so that early, scattered votes teach too; in a test fewer votes of neighbours are then among a part's own.
 
     Raises:
         ValueError: on an impossible layout.
@@ -86,6 +87,8 @@ class AttentionVote(nn.Module):
         self.voxel_size = settings.voxel_size or settings.voxel_fraction * diameter
         self.voting_radius = settings.voting_radius or radius
         self.test_voting_radius = settings.test_voting_radius
+        if self.test_voting_radius is None and settings.test_voting_share != 1:
+            self.test_voting_radius = settings.test_voting_share * self.voting_radius
         radii = tuple(radius * factor for factor in (1, 2, 3, 6))
         self.layout = Layout(tuple(settings.centers), tuple(settings.neighbors), radii)
         self.proposals, self.gathered, self.classes = settings.proposals, settings.gathered, settings.classes

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from attentionvote.section import check
-from attentionvote.setting import ChoicesOf, Setting, SettingError
+from attentionvote.setting import ChoicesOf, Identity, Setting, SettingError
 
 _FUSIONS = ChoicesOf("attentionvote.model.fusion", "FUSIONS", ("aml", "amx", "pn"), classes=True)
 Widths = tuple[int, ...]
@@ -50,8 +50,12 @@ class NetworkSettings:
     ] = None
     test_voting_radius: Annotated[
         float | None,
-        Setting("The same in validation, test and cell (Table 9); null = voting_radius.", above=0, high=10),
+        Setting("The same in validation, test and cell (Table 9), metres; null = test_voting_share.", above=0, high=10),
     ] = None
+    test_voting_share: Annotated[
+        float,
+        Setting("The same as a share of the training's radius.", above=0, high=10, identity=Identity.CHANGED),
+    ] = 1.0
     voting: Annotated[Widths, Setting("Hidden widths of the voting module.", low=1, high=100_000)]
     vote_rotation: Annotated[
         bool, Setting("Whether every vote also predicts its instance's rotation: not the paper's.")

@@ -133,7 +133,7 @@ class TrainerSettings:
     threads: Annotated[
         int | None,
         Setting(
-            "Of the arithmetic, of each process; null = its share of the cores.",
+            "Of the arithmetic, of each process; null = half of its share of the cores.",
             low=1,
             high=1024,
             identity=Identity.NEVER,

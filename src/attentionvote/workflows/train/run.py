@@ -51,7 +51,8 @@ class TrainingRun:
         self.process, self.first_does = process, first_does
         check_precision(cfg.trainer.precision, job.precision, device_type(cfg.trainer.accelerator))
         L.seed_everything(cfg.seed, verbose=False)
-        self.threads = cfg.trainer.threads or process.cores
+        # Half of the cores: the others as often as not are the same cores' second halves, and a loader wants one.
+        self.threads = cfg.trainer.threads or max(1, process.cores // 2)
         torch.set_num_threads(self.threads)
         self.clouds, self.module = cloud_settings(cfg), pose_training(cfg, job.part)
         self.workers = cfg.workers or cores()
