@@ -39,12 +39,12 @@ class NearestGroup(NamedTuple):
 
     def remarks(self, diameter: float) -> list[str]:
         """What is worth a word, the end of a sentence each: more than rounding, and rotations that are not listed."""
-        said = []
+        remarks = []
         if self.angle > EXACT_ANGLE or self.distance > EXACT_SHARE * diameter:
-            said.append(f"off by up to {np.degrees(self.angle):.2g} degrees and {round(self.distance, 4):.2g} mm")
+            remarks.append(f"off by up to {np.degrees(self.angle):.2g} degrees and {round(self.distance, 4):.2g} mm")
         if self.missing:
-            said.append(f"listed without {self.missing} of their products")
-        return said
+            remarks.append(f"listed without {self.missing} of their products")
+        return remarks
 
     @property
     def described(self) -> str:
@@ -73,8 +73,8 @@ def nearest_group(where: str, discrete: Array, continuous: Axes, diameter: float
     missing = 0
     if continuous:
         symmetry, exact, angle = _revolution(where, turns, directions)
-    elif (found := nearest_symmetry(turns)) is not None:
-        symmetry, angle = found
+    elif (nearest := nearest_symmetry(turns)) is not None:
+        symmetry, angle = nearest
         group = symmetry.rotations()
         index = nearest_elements(group, turns)
         exact, missing = group[index], len(group) - len({0, *index.tolist()})

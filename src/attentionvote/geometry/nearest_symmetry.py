@@ -44,8 +44,8 @@ def nearest_symmetry(rotations: Array, tolerance: float = TOLERANCE) -> tuple[Sy
             return whole
     some = attempts[-1]
     for apart in PRECISE:
-        if found := _generated_fit(some, apart, tolerance):
-            return found
+        if precise := _generated_fit(some, apart, tolerance):
+            return precise
     coarse = [_generated_fit(some, apart, tolerance) for apart in COARSE]
     return min((fit for fit in coarse if fit), key=lambda fit: len(fit[0].rotations()), default=None)
 
@@ -82,14 +82,14 @@ def _snapped(group: Array) -> Array:
 
 def _distinct(rotations: Array) -> Array:
     """The rotations without repetitions and without the identity."""
-    kept = np.empty((len(rotations) + 1, 3, 3))
-    kept[0], count = np.eye(3), 1
+    distinct = np.empty((len(rotations) + 1, 3, 3))
+    distinct[0], count = np.eye(3), 1
     for rotation in rotations:
-        nearest = nearest_elements(kept[:count], rotation[None])[0]
-        if rotation_angle(kept[nearest], rotation) > SAME:
-            kept[count] = rotation
+        nearest = nearest_elements(distinct[:count], rotation[None])[0]
+        if rotation_angle(distinct[nearest], rotation) > SAME:
+            distinct[count] = rotation
             count += 1
-    return kept[1:count]
+    return distinct[1:count]
 
 
 def _fit(symmetry: Symmetry | None, listed: Array, tolerance: float) -> tuple[Symmetry, float] | None:
@@ -106,21 +106,21 @@ def _fit(symmetry: Symmetry | None, listed: Array, tolerance: float) -> tuple[Sy
 
 def _generated_fit(generators: Array, apart: float, tolerance: float) -> tuple[Symmetry, float] | None:
     """As ``_fit`` for what ``generators`` make; any angle is some steps of some group, so two of them must be near."""
-    if (found := _fit(_fitted(_generated(generators, apart)), generators, tolerance)) is None:
+    if (fit := _fit(_fitted(_generated(generators, apart)), generators, tolerance)) is None:
         return None
-    step = float(rotation_angle(found[0].rotations()[1:], np.eye(3)).min())
+    step = float(rotation_angle(fit[0].rotations()[1:], np.eye(3)).min())
     those = np.concatenate([np.eye(3)[None], generators])
     apart_by = rotation_angle(those[:, None], those) + 2 * np.pi * np.eye(len(those))
-    return found if apart_by.min() < FEW_STEPS * step + tolerance else None
+    return fit if apart_by.min() < FEW_STEPS * step + tolerance else None
 
 
 def _fitted(elements: Array | None) -> Symmetry | None:
     """The group that ``elements`` ``(G, 3, 3)``, the identity first, are all of; how well they fit is not judged."""
     if elements is None or len(elements) < 2:
         return None
-    found = _about_an_axis(elements)
-    if found is not None or len(elements) not in POLYHEDRAL:
-        return found
+    symmetry = _about_an_axis(elements)
+    if symmetry is not None or len(elements) not in POLYHEDRAL:
+        return symmetry
     group = exact_group(elements)
     turn = _alignment(group, elements)
     try:
