@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import generate
@@ -65,6 +66,8 @@ def test_the_presets_are_valid_and_spell_out_the_defaults(simulation: str) -> No
     specs = scene_set_specs(part, cfg.simulation)
     assert set(specs) == {"train", "val", "test"}
     if simulation == "default":
-        assert specs["train"] == SceneSetSpec(part.digest, "train", cfg.simulation.cycles["train"])
+        assert specs["val"] == SceneSetSpec(part.digest, "val", cfg.simulation.cycles["val"])
+        assert specs["train"] == replace(specs["val"], split="train", cycles=90, pile_share=0.75)
+        assert specs["test"] == replace(specs["val"], split="test", cycles=30, keep_every=3)
     else:
         assert (specs["train"].drop.timestep, specs["train"].drop.contact_time) == (0.008, 0.02)
