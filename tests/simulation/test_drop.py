@@ -49,6 +49,13 @@ def test_same_seed_same_piles_other_seed_others(bracket: Part, hulls: Hulls) -> 
     assert not np.allclose(a, c, atol=1e-3)
 
 
+def test_fewer_drops_are_the_beginning_of_the_cycle(bracket: Part, hulls: Hulls) -> None:
+    part_ids, rng = np.zeros(4, dtype=np.int32), np.random.default_rng(1)
+    result = list(drop_parts([Solid(bracket, hulls)], part_ids, BIN, 0.4, DropSettings(), rng, drops=2))
+    assert [len(pile) for pile in result] == [1, 2]
+    np.testing.assert_array_equal(result[-1], piles(bracket, hulls, 4, seed=1)[1])
+
+
 def test_a_full_bin_ends_the_cycle(bracket: Part, hulls: Hulls) -> None:
     low = np.array([0.08, 0.07, 0.03])
     result = piles(bracket, hulls, 12, bin_size=low)

@@ -41,12 +41,12 @@ def simulate_cycle(
     scale = spec.bin.scaling_diameter(part, most)
     bin_size = spec.bin.sample(scale, rng)
     friction = float(rng.uniform(*spec.drop.friction))
-    seeds = dict(zip(spec.drop_counts, scene_seeds, strict=True))
-    kept = spec.counts_of(cycle)
+    counts = spec.counts_of(cycle)
+    seeds = {count: seed for count, seed in zip(spec.drop_counts, scene_seeds, strict=True) if count in counts}
     records = []
-    for bin_from_part in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng):
+    for bin_from_part in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng, drops=counts[-1]):
         count = len(bin_from_part)
-        if count not in kept:
+        if count not in seeds:
             continue
         scene_rng = np.random.default_rng(seeds[count])
         camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
@@ -68,8 +68,6 @@ def simulate_cycle(
                 part_ids=dropped_ids,
             )
         )
-        if count == kept[-1]:
-            break
     return records
 
 

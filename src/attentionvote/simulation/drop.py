@@ -37,6 +37,7 @@ def drop_parts(
     friction: float,
     settings: DropSettings,
     rng: np.random.Generator,
+    drops: int | None = None,
 ) -> Iterator[NDArray[np.float64]]:
     """Drop parts in sequence and yield every pile that came to rest.
 
@@ -51,6 +52,7 @@ def drop_parts(
         friction: sliding friction coefficient of every surface.
         settings: physics settings.
         rng: decides places and orientations.
+        drops: end after so many; None drops all. The piles are the same.
 
     Yields:
         ``bin_from_part`` ``(k, 4, 4)`` of the first k parts, once per accepted drop.
@@ -62,7 +64,7 @@ def drop_parts(
     vertices = [np.concatenate(solid.hulls) for solid in solids]
     half = np.asarray(bin_size[:2]) / 2
     pile_top = 0.0
-    for k, kind in enumerate(part_ids):
+    for k, kind in enumerate(part_ids[:drops]):
         height = pile_top + 0.3 * solids[kind].part.diameter
         _release(model, data, k, vertices[kind], half, height, settings.speed, rng)
         speed = _settle(model, data, k + 1, settings)

@@ -59,11 +59,12 @@ class Muon(Optimizer):
         betas: tuple[float, float] = (0.9, 0.95),
         eps: float = 1e-8,
     ) -> None:
-        everything = list(weights)
-        matrices = [w for w in everything if w.ndim == 2 and min(w.shape) >= LEAST_WIDTH]
-        chosen = {id(w) for w in matrices}
-        others = [w for w in everything if id(w) not in chosen]
-        narrow, plain = [w for w in others if w.ndim > 1], [w for w in others if w.ndim <= 1]
+        matrices: list[Tensor] = []
+        narrow: list[Tensor] = []
+        plain: list[Tensor] = []
+        for weight in weights:
+            is_matrix = weight.ndim == 2 and min(weight.shape) >= LEAST_WIDTH
+            (matrices if is_matrix else narrow if weight.ndim > 1 else plain).append(weight)
         groups = [
             {"params": matrices, "orthogonal": True, "weight_decay": weight_decay},
             {"params": narrow, "orthogonal": False, "weight_decay": weight_decay, "lr": _ADAM_SHARE * lr},

@@ -30,11 +30,11 @@ def optimizer_of(
     Raises:
         ValueError, TypeError: of the optimizer.
     """
+    if kind == "muon":
+        return Muon(weights, lr=rate, weight_decay=decay)
     everything = list(weights)
     decayed = [p for p in everything if p.ndim > 1]
     plain = [p for p in everything if p.ndim <= 1]
-    if kind == "muon":
-        return Muon(everything, lr=rate, weight_decay=decay)
     if isinstance(kind, str):
         groups = [{"params": decayed, "weight_decay": decay}, {"params": plain, "weight_decay": 0.0}]
         adam = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[kind]
