@@ -10,11 +10,11 @@ import re
 from pathlib import Path
 from typing import Any
 
+from attentionvote.cad.part_configuration import _symmetry_settings, configuration_text
 from attentionvote.command.conf_folder import new_file
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import whole, write_whole
-from attentionvote.simulation.part_configuration import _symmetry_settings, configuration_text
 from attentionvote.workflows.settings import PartSettings
 
 log = logging.getLogger("attentionvote.part")
@@ -31,11 +31,11 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     if config.exists() and not cfg.force:
         raise ConfigurationError(f"object {name!r} exists already ({config}), add force=true to replace it")
 
+    from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface, write_surface
+    from attentionvote.cad.part_picture import write_picture
+    from attentionvote.cad.symmetry_detection import describe, detect_symmetry
     from attentionvote.geometry import pose
     from attentionvote.part import Part
-    from attentionvote.simulation.mesh import largest_vertex_distance, load_surface, write_surface
-    from attentionvote.simulation.part_picture import write_picture
-    from attentionvote.simulation.symmetry_detection import describe, detect_symmetry
 
     with configuring():
         vertices, faces = load_surface(cfg.mesh, cfg.units)

@@ -9,10 +9,10 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
+from attentionvote.cad.mesh_file import write_surface
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.section import Target
-from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
-from attentionvote.simulation.mesh import write_surface
 from attentionvote.simulation.part_files import load_part
 
 FROM_DATASETS = {"bunny": 0.234355236, "tless_20": 0.107, "tless_22": 0.108, "tless_29": 0.135}

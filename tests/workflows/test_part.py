@@ -104,7 +104,7 @@ def test_what_is_wrong_is_said_before_anything_is_written(
 def test_a_failed_write_leaves_nothing_half_written(
     mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from attentionvote.simulation import part_picture
+    from attentionvote.cad import part_picture
 
     def fails(_: object, path: Path) -> None:
         path.write_bytes(b"half")

@@ -10,6 +10,7 @@ import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
+from attentionvote.cad.mesh_file import write_surface
 from attentionvote.contract import ModelCard
 from attentionvote.files import naming_full_disk, sync
 from attentionvote.inference import BundleError, Estimate, PoseEstimator
@@ -17,7 +18,6 @@ from attentionvote.inference.bundles.bundle import Bundle, load_bundle
 from attentionvote.inference.bundles.manifest import CARD, GOLDEN, MESH, MODEL, write_manifest
 from attentionvote.inference.golden import clear_confidence, self_test
 from attentionvote.part import Parts
-from attentionvote.simulation.mesh import write_surface
 
 LATEST = "latest"
 _DRAFT, _OLD, _LINK = ".writing-bundle", ".old-bundle", ".writing-link"

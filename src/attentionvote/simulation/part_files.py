@@ -48,8 +48,8 @@ def load_part(
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size), ("diameter", diameter)):
         if value is not None and not 0 < value <= 10:
             raise ValueError(f"{name}: {key} must be positive metres (at most 10) or null, got {value}")
-    from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
-    from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
+    from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
+    from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface
 
     group = _symmetry(name, symmetry)
     if mesh.startswith(BUILTIN):

@@ -113,7 +113,7 @@ def penetration(material: Material, record: SceneRecord) -> float:
     """Greatest depth, as a share of D, of a surface point of one part inside another, on the true surfaces."""
     import trimesh
 
-    from attentionvote.simulation.surface_distance import SurfaceDistance
+    from attentionvote.cad.surface_distance import SurfaceDistance
 
     deepest, poses, kinds = 0.0, record.camera_from_part, record.part_ids
     parts = material.part.parts

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
+from attentionvote.cad.symmetry_detection import describe
 from attentionvote.part import Part
-from attentionvote.simulation.symmetry_detection import describe
 
 VIEWS = ((25, -60, "from above"), (-25, 120, "from below, behind"), (0, 0, "along x"))
 MOST_FACES = 30_000

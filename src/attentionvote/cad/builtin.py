@@ -16,9 +16,10 @@ import numpy as np
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
+from attentionvote.cad import builtin_industrial as industrial
+from attentionvote.cad import builtin_standins as standins
+from attentionvote.cad.mesh_file import largest_vertex_distance
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.simulation import cad_industrial, cad_standins
-from attentionvote.simulation.mesh import largest_vertex_distance
 
 
 @dataclass(frozen=True)
@@ -35,21 +36,19 @@ C2 = Symmetry("cyclic", order=2)
 REVOLUTION = Symmetry("revolution")
 
 BUILTIN_PARTS: dict[str, BuiltinPart] = {
-    "connecting_rod": BuiltinPart(cad_industrial.connecting_rod, 0.143, C2, "Connecting rod, 143 mm"),
+    "connecting_rod": BuiltinPart(industrial.connecting_rod, 0.143, C2, "Connecting rod, 143 mm"),
     "vertical_bearing_pedestal": BuiltinPart(
-        cad_industrial.vertical_bearing_pedestal, 0.165, Symmetry(), "Vertical bearing pedestal, 165 mm"
+        industrial.vertical_bearing_pedestal, 0.165, Symmetry(), "Vertical bearing pedestal, 165 mm"
     ),
     "slider_bearing_pedestal": BuiltinPart(
-        cad_industrial.slider_bearing_pedestal, 0.125, C2, "Slider bearing pedestal, 125 mm"
+        industrial.slider_bearing_pedestal, 0.125, C2, "Slider bearing pedestal, 125 mm"
     ),
-    "brick": BuiltinPart(cad_standins.brick, 0.037, C2, "Brick, 37 mm (stand-in for Siléane's)"),
-    "gear": BuiltinPart(cad_standins.gear, 0.121, REVOLUTION, "Gear, 121 mm (stand-in for Siléane's, no teeth)"),
-    "candlestick": BuiltinPart(
-        cad_standins.candlestick, 0.191, REVOLUTION, "Candlestick, 191 mm (stand-in for Siléane's)"
-    ),
-    "pepper": BuiltinPart(cad_standins.pepper, 0.335, REVOLUTION, "Pepper mill, 335 mm (stand-in for Siléane's)"),
-    "ring_screw": BuiltinPart(cad_standins.ring_screw, 0.155, C2, "Ring screw, 155 mm (stand-in for IPA's)"),
-    "gear_shaft": BuiltinPart(cad_standins.gear_shaft, 0.437, REVOLUTION, "Gear shaft, 437 mm (stand-in for IPA's)"),
+    "brick": BuiltinPart(standins.brick, 0.037, C2, "Brick, 37 mm (stand-in for Siléane's)"),
+    "gear": BuiltinPart(standins.gear, 0.121, REVOLUTION, "Gear, 121 mm (stand-in for Siléane's, no teeth)"),
+    "candlestick": BuiltinPart(standins.candlestick, 0.191, REVOLUTION, "Candlestick, 191 mm (stand-in for Siléane's)"),
+    "pepper": BuiltinPart(standins.pepper, 0.335, REVOLUTION, "Pepper mill, 335 mm (stand-in for Siléane's)"),
+    "ring_screw": BuiltinPart(standins.ring_screw, 0.155, C2, "Ring screw, 155 mm (stand-in for IPA's)"),
+    "gear_shaft": BuiltinPart(standins.gear_shaft, 0.437, REVOLUTION, "Gear shaft, 437 mm (stand-in for IPA's)"),
 }
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from attentionvote.cad.symmetry_detection import SymmetryFinding
     from attentionvote.part import Part
-    from attentionvote.simulation.symmetry_detection import SymmetryFinding
 
 # What a symmetry of each kind needs to be said.
 _KEYS: dict[str, tuple[str, ...]] = {
@@ -22,7 +22,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
 
 def configuration_text(part: Part, finding: SymmetryFinding, mesh: Path, source: str) -> str:
     """The object's configuration file, every figure with what it is and how it was found."""
-    from attentionvote.simulation.symmetry_detection import describe
+    from attentionvote.cad.symmetry_detection import describe
 
     d = part.diameter
     root = "; ".join(" ".join(f"{v + 0.0:.7f}" for v in row) for row in part.covariance_root.round(7))

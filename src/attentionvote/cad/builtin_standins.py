@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from manifold3d import Manifold
 
-from attentionvote.simulation.cad_shapes import Point, box, ring, turned
+from attentionvote.cad.builtin_shapes import Point, box, ring, turned
 
 
 def brick() -> Manifold:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from attentionvote.simulation.mesh import FORMATS, largest_vertex_distance, load_surface, write_surface
+from attentionvote.cad.mesh_file import FORMATS, largest_vertex_distance, load_surface, write_surface
 
 
 def wedge() -> trimesh.Trimesh:

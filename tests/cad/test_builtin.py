@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from surface_symmetry import symmetry_residual
 
+from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
+from attentionvote.cad.mesh_file import largest_vertex_distance
 from attentionvote.geometry.pose import rotation_about
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
-from attentionvote.simulation.mesh import largest_vertex_distance
 
 NOMINAL_MM = {
     "connecting_rod": 143,

@@ -11,11 +11,11 @@ import pytest
 import trimesh
 from surface_symmetry import symmetry_residual
 
+from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
+from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface
+from attentionvote.cad.symmetry_detection import describe, detect_symmetry
 from attentionvote.geometry.pose import apply, inverse, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.geometry.symmetry import Symmetry
-from attentionvote.simulation.cad import BUILTIN_PARTS, builtin_surface
-from attentionvote.simulation.mesh import largest_vertex_distance, load_surface
-from attentionvote.simulation.symmetry_detection import describe, detect_symmetry
 
 ANYWHERE = transform(matrix_from_quaternion([0.3, -0.5, 0.7, 0.4]), [0.4, -1.0, 2.0])
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.cad.symmetry_search import quaternions_of
 from attentionvote.geometry import pose
 from attentionvote.geometry.symmetry import Axis, Symmetry
-from attentionvote.simulation.symmetry_search import quaternions_of
 
 Array = NDArray[np.float64]
 

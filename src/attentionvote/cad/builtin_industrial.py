@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from manifold3d import CrossSection, Manifold
 
-from attentionvote.simulation.cad_shapes import (
+from attentionvote.cad.builtin_shapes import (
     box,
     cylinder,
     disc,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.cad.surface_distance import RotationCheck
 from attentionvote.geometry.nearest_symmetry import exact_group
 from attentionvote.geometry.pose import quaternion_from_matrix, rotation_about
-from attentionvote.simulation.surface_distance import RotationCheck
 
 Array = NDArray[np.float64]
 

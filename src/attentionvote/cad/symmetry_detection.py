@@ -21,13 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.cad.mesh_file import largest_vertex_distance
+from attentionvote.cad.part_frame import SNAP_ANGLE, axis_of, nearest_fixed_point, principal_frame, turned
+from attentionvote.cad.surface_distance import RotationCheck
+from attentionvote.cad.symmetry_search import closure, quaternions_of, refine_axis, search_axes
 from attentionvote.geometry import pose
 from attentionvote.geometry.symmetry import Axis, Symmetry
 from attentionvote.part import surface_moments
-from attentionvote.simulation.mesh import largest_vertex_distance
-from attentionvote.simulation.part_frame import SNAP_ANGLE, axis_of, nearest_fixed_point, principal_frame, turned
-from attentionvote.simulation.surface_distance import RotationCheck
-from attentionvote.simulation.symmetry_search import closure, quaternions_of, refine_axis, search_axes
 
 Array = NDArray[np.float64]
 

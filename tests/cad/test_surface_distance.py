@@ -8,8 +8,8 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from attentionvote.cad.surface_distance import RotationCheck, SurfaceDistance, point_triangle_distance
 from attentionvote.geometry.pose import matrix_from_quaternion, random_quaternion, rotation_about
-from attentionvote.simulation.surface_distance import RotationCheck, SurfaceDistance, point_triangle_distance
 
 
 def reference(point: np.ndarray, triangle: np.ndarray) -> float:

@@ -1,0 +1,1 @@
+"""Parts as CAD has them: files to surfaces, the symmetry of a surface, the parts built in."""
