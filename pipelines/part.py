@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from attentionvote.cad.part_configuration import _symmetry_settings, configuration_text
+from attentionvote.cad.part_configuration import configuration_text, symmetry_settings
 from attentionvote.command.conf_folder import new_file
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
@@ -33,7 +33,8 @@ def run(cfg: PartSettings) -> dict[str, Any]:
 
     from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface, write_surface
     from attentionvote.cad.part_picture import write_picture
-    from attentionvote.cad.symmetry_detection import describe, detect_symmetry
+    from attentionvote.cad.part_report import examine
+    from attentionvote.cad.symmetry_detection import describe
     from attentionvote.geometry import pose
     from attentionvote.part import Part
 
@@ -42,18 +43,25 @@ def run(cfg: PartSettings) -> dict[str, Any]:
         diameter = largest_vertex_distance(vertices)
         size = " x ".join(f"{e * 1000:.1f}" for e in vertices.max(0) - vertices.min(0))
         log.info("%s: %d triangles, %s mm, D %.2f mm; looking for symmetries", name, len(faces), size, diameter * 1e3)
-        finding = detect_symmetry(vertices, faces, cfg.tolerance)
+        report = examine(vertices, faces, cfg.tolerance)
+    finding = report.finding
     vertices = pose.apply(finding.part_from_file, vertices)
     title = cfg.title or name.replace("_", " ").capitalize()
     part = Part(name, vertices, faces, round(diameter, 9), finding.symmetry, str(title))
     log.info("symmetry %s, residual %.3f mm", describe(finding.symmetry), finding.residual * 1e3)
+    if report.hidden:
+        log.info(" ".join(report.hidden_lines))
+    for twin in report.near_symmetric:
+        log.info("nearly symmetric: turned by %s the part is %.0f %% alike", twin["quaternion"], 100 * twin["overlap"])
+    if not report.is_mirror_symmetric:
+        log.info("the part's mirror image is %s", report.mirror_line)
     if finding.moved:
         log.info("the part frame is not the file's: see part_from_file in %s", config)
 
     mesh, picture = Path(cfg.parts) / f"{name}.ply", Path(cfg.parts) / f"{name}.png"
     whole(mesh, lambda path: write_surface(part.vertices, part.faces, path))
     whole(picture, lambda path: write_picture(part, path))
-    text = configuration_text(part, finding, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
+    text = configuration_text(part, report, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
     write_whole(config, text)
     log.info("look at %s, then: make train OBJECT=%s", picture, name)
     return {
@@ -65,11 +73,15 @@ def run(cfg: PartSettings) -> dict[str, Any]:
         "triangles": len(part.faces),
         "diameter": part.diameter,
         "covariance_root": part.covariance_root.round(9),
-        "symmetry": _symmetry_settings(part),
+        "symmetry": symmetry_settings(part),
         "symmetry_residual": finding.residual,
         "symmetry_tolerance": finding.tolerance,
         "runner_up": finding.runner_up,
         "runner_up_residual": finding.runner_up_residual if finding.runner_up_residual < 1e9 else None,
+        "hidden_symmetry": describe(report.hidden.symmetry) if report.hidden else None,
+        "hidden_symmetry_residual": report.hidden.residual if report.hidden else None,
+        "near_symmetric": report.near_symmetric,
+        "mirror_image": report.mirror,
         "moved": finding.moved,
         "part_from_file": finding.part_from_file.round(9),
     }

@@ -3,10 +3,14 @@
 A symmetry leaves the surface centroid in place and commutes with the surface covariance, so the principal
 frame names nearly all candidates: three half turns where the principal moments differ, turns of any order
 about the single axis where two are equal, a search over all directions where all three are. What counts is
-only the check: every rotation of the group, applied to the surface, must leave it within ``tolerance``
-(0.3 % of the diameter by default) of itself everywhere, measured from dense points and corners to the exact
-surface, both ways. A faceted cylinder is therefore a body of revolution as soon as its facets' height is
-below the tolerance, and a part whose only asymmetry is a mark lower than that counts as symmetric.
+only the check: every rotation of the group, applied to the surface, must leave it within ``tolerance`` of itself
+everywhere, measured from dense points and corners to the exact surface, both ways. The tolerance is tight (0.03 % of
+the diameter by default), because a symmetry that is none teaches the network that two different poses are one.
+
+Curves of a CAD part come as facets, and what the facets' own height explains is no difference
+(``tessellation.facet_heights``): a cylinder of 16 facets is a body of revolution, a hexagon and a gear of 24 teeth are
+not. What a sensor could not see beyond that, a thread or an engraved mark, is reported (``hidden_symmetry``) and is the
+user's to decide.
 
 The part frame is the file's own wherever possible: the axis must pass through the file's origin (all axes,
 if there are several) and the origin must lie inside the bounding box. Otherwise the part is moved: origin
@@ -23,17 +27,20 @@ from numpy.typing import NDArray
 
 from attentionvote.cad.mesh_file import largest_vertex_distance
 from attentionvote.cad.part_frame import SNAP_ANGLE, axis_of, nearest_fixed_point, principal_frame, turned
-from attentionvote.cad.surface_distance import RotationCheck
-from attentionvote.cad.symmetry_search import closure, quaternions_of, refine_axis, search_axes
+from attentionvote.cad.rotation_check import RotationCheck
+from attentionvote.cad.symmetry_search import closure, quaternions_of, refine_axis, search_axes, turns_about
 from attentionvote.geometry import pose
 from attentionvote.geometry.symmetry import Axis, Symmetry
 from attentionvote.part import surface_moments
 
 Array = NDArray[np.float64]
 
-TOLERANCE = 0.003  # of the diameter
+TOLERANCE = 0.0003  # of the diameter
+UNSEEN = 0.003  # of the diameter: what a sensor hardly sees of a part that fills its picture
+THIN = 0.1  # of the part's thickness: a sheet is not turned over within a tolerance of its own thickness
 EQUAL_MOMENTS = 0.04  # relative difference of principal radii below which they may be equal
 LARGEST_ORDER = 180
+MOST_ORDERS = 12  # that are looked at closely; divisors of the right one fit as well as it does
 # Turns by multiples of the golden angle: no small part of a full turn, so no finite group contains them.
 REVOLUTION_ANGLES = np.mod(2 * np.pi * np.arange(1, 17) * (5**0.5 - 1) / 2, 2 * np.pi)
 
@@ -43,9 +50,9 @@ class SymmetryFinding:
     """What was found.
 
     ``symmetry`` is in the part frame; ``part_from_file`` ``(4, 4)`` is the identity unless ``moved``.
-    ``residual`` (largest distance of a turned surface to itself over the whole group), ``tolerance`` and
-    ``runner_up_residual`` (of the best hypothesis that was rejected: a lower bound, its axis in the file's frame) are
-    metres.
+    ``residual`` (largest distance of a turned surface to itself over the whole group, beyond the height of its
+    facets), ``facet_height`` (of the coarsest curve), ``diameter``, ``tolerance`` and ``runner_up_residual`` (of the
+    best hypothesis that was rejected: a lower bound, its axis in the file's frame) are metres.
     """
 
     symmetry: Symmetry
@@ -55,6 +62,8 @@ class SymmetryFinding:
     tolerance: float
     runner_up: str
     runner_up_residual: float
+    facet_height: float
+    diameter: float
 
 
 def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float = TOLERANCE) -> SymmetryFinding:
@@ -64,7 +73,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
         vertices: ``(V, 3)`` metres, any frame.
         faces: ``(F, 3)`` closed surface.
         tolerance: largest distance between surface and turned surface, as a fraction of the largest
-            vertex distance.
+            vertex distance; at most a tenth of the part's thickness counts.
 
     Raises:
         ValueError: on an impossible tolerance, or a ball (it has no orientation to estimate).
@@ -73,25 +82,64 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
         raise ValueError(f"symmetry tolerance must be above 0 and at most 0.05 of the diameter, got {tolerance}")
     diameter = largest_vertex_distance(vertices)
     _, centroid, covariance = surface_moments(vertices, faces)
-    check = RotationCheck(vertices - centroid, faces, tolerance * diameter)
+    across = (vertices - centroid) @ np.linalg.eigh(covariance)[1]
+    limit = min(tolerance * diameter, THIN * float(np.ptp(across, axis=0).min()))
+    check = RotationCheck(vertices - centroid, faces, limit)
     detection = _Detection(check, covariance)
     symmetry = _tidy(detection.group())
-    part_from_file = principal_frame(symmetry, vertices, centroid, covariance, diameter)
+    centre = centroid + check.centre(_generators(symmetry)) if symmetry.kind != "none" else centroid
+    part_from_file = principal_frame(symmetry, vertices, centre, covariance, diameter)
     moved = not np.array_equal(part_from_file, np.eye(4))
     # The last word: the symmetry exactly as it will be written, about the origin that it will be written for.
-    fixed_point = centroid if moved else nearest_fixed_point(symmetry, centroid)
-    final = RotationCheck(vertices - fixed_point, faces, tolerance * diameter)
-    residual = max((final.residual(r) for r in tested_rotations(symmetry)), default=0.0)
+    fixed_point = (centre if moved else nearest_fixed_point(symmetry, centre)) - centroid
+    residual = max((check.residual(r, centre=fixed_point) for r in tested_rotations(symmetry)), default=0.0)
     runner_up, runner_up_residual = detection.runner_up()
     return SymmetryFinding(
         symmetry=turned(symmetry, part_from_file[:3, :3]),
         part_from_file=part_from_file,
         moved=moved,
         residual=residual,
-        tolerance=tolerance * diameter,
+        tolerance=limit,
         runner_up=runner_up,
         runner_up_residual=runner_up_residual,
+        facet_height=check.facet_height,
+        diameter=diameter,
     )
+
+
+def hidden_symmetry(vertices: Array, faces: NDArray[np.int64], finding: SymmetryFinding) -> SymmetryFinding | None:
+    """The larger group that the part has when differences below ``UNSEEN`` of its diameter are overlooked, if any.
+
+    Args:
+        vertices: ``(V, 3)`` metres, in the file's frame.
+        faces: ``(F, 3)`` closed surface.
+        finding: what the part has without overlooking anything.
+
+    Raises:
+        ValueError: as ``detect_symmetry``.
+    """
+    if finding.tolerance >= UNSEEN * finding.diameter:
+        return None
+    larger = detect_symmetry(vertices, faces, UNSEEN)
+    return larger if group_size(larger.symmetry) > group_size(finding.symmetry) else None
+
+
+def group_size(symmetry: Symmetry) -> float:
+    """Number of rotations of the group; of a body of revolution more than of any finite group, with flip the double."""
+    return len(symmetry.rotations()) * (1e6 if symmetry.is_revolution else 1.0)
+
+
+def _generators(symmetry: Symmetry) -> Array:
+    """A few rotations ``(R, 3, 3)`` whose fixed points the whole group shares."""
+    if symmetry.is_revolution:
+        turns = pose.rotation_about(symmetry.axis, np.array([np.pi / 2, np.pi]))
+        return np.concatenate([turns, symmetry.rotations()[1:]])
+    rotations = symmetry.rotations()[1:]
+    far = rotations[np.argsort(np.trace(rotations, axis1=1, axis2=2))]  # small turns tell little of their centre
+    if symmetry.kind == "cyclic":
+        return far[:2]
+    # Half turns about different axes, which all groups with several axes have, and the turns between them.
+    return np.concatenate([far[:3], far[-1:]])
 
 
 def tested_rotations(symmetry: Symmetry) -> Array:
@@ -145,29 +193,34 @@ class _Detection:
     def _accept(self, symmetry: Symmetry) -> bool:
         """Whether the whole group leaves the surface in place."""
         rotations = tested_rotations(symmetry)
-        if self.check.holds(rotations):
+        centre = self.check.centre(_generators(symmetry))
+        if self.check.holds(rotations, centre):
             return True
         if symmetry.order <= 12:  # larger ones turn so little that their residual says nothing
-            self.rejected.append((self.check.worst(rotations), describe(symmetry)))
+            self.rejected.append((self.check.worst(rotations, centre), describe(symmetry)))
         return False
+
+    def _refined(self, axis: Array, order: int = 2) -> Array:
+        """The axis near ``axis`` whose turns fit best; the principal axes of a tessellated surface are a little off."""
+        return refine_axis(self.check, axis, 2 * np.pi / order * (order // 2)) if self.check.facet_height else axis
 
     def _half_turns(self) -> Symmetry:
         """Three different principal moments: nothing but half turns about the principal axes."""
-        turns = [Symmetry("cyclic", axis_of(u), 2) for u in self.axes[::-1]]
+        turns = [Symmetry("cyclic", axis_of(self._refined(u)), 2) for u in self.axes[::-1]]
         accepted = [s for s in turns if self._accept(s)]
         if len(accepted) >= 2:
-            both = Symmetry("dihedral", accepted[0].axis, 2, flip_axis=accepted[1].axis)
+            both = Symmetry("dihedral", accepted[0].axis, 2, flip_axis=_across(accepted[0].axis, accepted[1].axis))
             if self._accept(both):
                 return both
         return accepted[0] if accepted else Symmetry()
 
     def _single_axis(self, axis: Array, other: Array) -> Symmetry:
         """Two equal principal moments: turns about ``axis``, half turns about axes across it."""
-        revolution = Symmetry("revolution", axis_of(axis))
+        revolution = Symmetry("revolution", axis_of(self._refined(axis)))
         if self._accept(revolution):
-            flipped = Symmetry("revolution", axis_of(axis), flip=True)
+            flipped = Symmetry("revolution", revolution.axis, flip=True)
             return flipped if self._accept(flipped) else revolution
-        order = self._order(axis)
+        order, axis = self._order(axis)
         across = self._across(axis, other, order)
         if across is None:
             return Symmetry("cyclic", axis_of(axis), order) if order > 1 else Symmetry()
@@ -176,15 +229,22 @@ class _Detection:
         dihedral = Symmetry("dihedral", axis_of(axis), order, flip_axis=axis_of(across))
         return dihedral if self._accept(dihedral) else Symmetry("cyclic", axis_of(axis), order)
 
-    def _order(self, axis: Array) -> int:
-        """The largest order of a cyclic group about ``axis``; all its turns are checked, not one."""
-        for order in range(LARGEST_ORDER, 1, -1):
-            near_half = pose.rotation_about(axis, 2 * np.pi / order * (order // 2))
-            if order > 12 and self.check.residual(near_half, self.check.screen[::15]) > self.check.tolerance:
-                continue
-            if self._accept(Symmetry("cyclic", axis_of(axis), order)):
-                return order
-        return 1
+    def _order(self, axis: Array) -> tuple[int, Array]:
+        """The largest order of a cyclic group about ``axis``, and the axis; all its turns are checked, not one."""
+        orders = np.arange(2, LARGEST_ORDER + 1)
+        turns = (pose.rotation_about(axis, 2 * np.pi / order * np.arange(1, order)) for order in orders)
+        off = np.array([self.check.roughly(rotations) for rotations in turns])
+        for order in range(2, 13):  # larger ones turn so little that their residual says nothing
+            if off[order - 2] > self.check.tolerance + self.check.facet_height:
+                self.rejected.append((float(off[order - 2]), describe(Symmetry("cyclic", axis_of(axis), order))))
+        # The axis is not refined yet: what is nearest counts, and of these the largest.
+        slack = off.min() + self.check.tolerance + self.check.facet_height / 4
+        nearest = orders[off <= slack][np.argsort(off[off <= slack], kind="stable")][:MOST_ORDERS]
+        for order in sorted({*nearest.tolist(), *orders[:11][off[:11] <= slack].tolist()}, reverse=True):
+            refined = self._refined(axis, order)
+            if self._accept(Symmetry("cyclic", axis_of(refined), order)):
+                return order, refined
+        return 1, axis
 
     def _across(self, axis: Array, other: Array, order: int) -> Array | None:
         """An axis perpendicular to ``axis`` whose half turn holds; they repeat every half turn / ``order``."""
@@ -192,7 +252,7 @@ class _Detection:
         count = max(16, int(np.ceil(period / np.radians(1.0))))
         angles = np.arange(count) * period / count
         axes = pose.rotation_about(axis, angles) @ other
-        scores = np.array([self.check.mean(pose.rotation_about(u, np.pi)) for u in axes])
+        scores = self.check.means(turns_about(axes, np.pi))
         minima = np.flatnonzero((scores <= np.roll(scores, 1)) & (scores <= np.roll(scores, -1)))
         for i in minima[np.argsort(scores[minima])][:8]:
             across = refine_axis(self.check, axes[i], np.pi)
@@ -231,6 +291,12 @@ class _Detection:
         return self._single_axis(axis, np.asarray(Symmetry("none", axis_of(axis)).perpendicular))
 
 
+def _across(axis: Axis, other: Axis) -> Axis:
+    """``other`` made exactly perpendicular to ``axis``."""
+    u = np.asarray(other) - np.dot(other, axis) * np.asarray(axis)
+    return axis_of(u / np.linalg.norm(u))
+
+
 def _tidy(symmetry: Symmetry) -> Symmetry:
     """Axes within 0.05 degrees of a coordinate axis become that axis."""
 
@@ -243,6 +309,5 @@ def _tidy(symmetry: Symmetry) -> Symmetry:
         return symmetry
     axis, flip_axis = snapped(symmetry.axis), snapped(symmetry.flip_axis)
     if symmetry.kind == "dihedral":
-        f = np.asarray(flip_axis) - np.dot(flip_axis, axis) * np.asarray(axis)
-        flip_axis = snapped(axis_of(f / np.linalg.norm(f)))
+        flip_axis = snapped(_across(axis, flip_axis))
     return Symmetry(symmetry.kind, axis, symmetry.order, symmetry.flip, flip_axis)

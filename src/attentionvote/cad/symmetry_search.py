@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.cad.surface_distance import RotationCheck
+from attentionvote.cad.rotation_check import RotationCheck
 from attentionvote.geometry.nearest_symmetry import exact_group
-from attentionvote.geometry.pose import quaternion_from_matrix, rotation_about
+from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix, rotation_about
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,13 @@ def hemisphere(step: float) -> Array:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
 
 
+def turns_about(axes: Array, angle: float) -> Array:
+    """Rotations ``(N, 3, 3)`` by ``angle`` radians about unit ``axes`` ``(N, 3)``."""
+    half = angle / 2
+    quaternions = np.concatenate([np.full((len(axes), 1), np.cos(half)), np.sin(half) * axes], axis=1)
+    return matrix_from_quaternion(quaternions)
+
+
 def search_axes(check: RotationCheck, step: float = np.radians(4.0)) -> list[tuple[Array, int]]:
     """(axis, prime order) of rotations that leave the surface in place, wherever the axis points.
 
@@ -36,7 +43,7 @@ def search_axes(check: RotationCheck, step: float = np.radians(4.0)) -> list[tup
     symmetries: list[tuple[Array, int]] = []
     for order in ORDERS:
         angle = 2 * np.pi / order
-        scores = np.array([check.mean(rotation_about(u, angle)) for u in axes])
+        scores = check.means(turns_about(axes, angle))
         cosine = np.abs(axes @ axes.T)
         is_near = cosine > np.cos(1.6 * step)
         is_minimum = np.array([s <= scores[near].min() for s, near in zip(scores, is_near, strict=True)])
@@ -54,7 +61,9 @@ def search_axes(check: RotationCheck, step: float = np.radians(4.0)) -> list[tup
 
 def refine_axis(check: RotationCheck, axis: Array, angle: float) -> Array:
     """The unit axis near ``axis`` about which a turn by ``angle`` fits the surface best."""
-    rotation = check.refined(rotation_about(axis, angle))
+    rotation, _ = check.registered(rotation_about(axis, angle))
+    if check.facet_height:  # else the few points of a screen tell as much; a small bore may be all that tells the axis
+        rotation, _ = check.registered(rotation, rounds=6, points=check.points)
     if abs(np.trace(rotation) - 1 - 2 * np.cos(angle)) > 0.2:  # fell into another symmetry
         return axis
     values, vectors = np.linalg.eig(rotation)

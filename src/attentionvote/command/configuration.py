@@ -120,8 +120,27 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
         checked = settings.of(_plain(_compose(name, words, conf)))
     except SettingError as error:
         raise ConfigurationError(sentence(error)) from error
+    _check_name(checked, parsed, conf)
     object.__setattr__(checked, "words", tuple(overrides))
     return checked
+
+
+def _check_name(settings: VerbSettings, parsed: Sequence[Override], conf: Path) -> None:
+    """Refuse an object whose file has the name of another: its data, trainings and champion would be the other's.
+
+    Raises:
+        ConfigurationError: naming the file and both names.
+    """
+    chosen = [o.value() for o in parsed if o.key_or_group == "object" and o.input_line]
+    if not chosen or any(o.key_or_group == "object.name" for o in parsed):
+        return
+    name = settings.composed.get("object", {}).get("name")
+    if isinstance(chosen[-1], str) and name != chosen[-1]:
+        file = next(f for folder in folders(conf) if (f := folder / "object" / f"{chosen[-1]}.yaml").is_file())
+        raise ConfigurationError(
+            f"name in {file} must be that of the file, {chosen[-1]!r}, got {name!r}: data, trainings and champion "
+            f"would be those of {name}; correct the name, or rename the file"
+        )
 
 
 @lru_cache(maxsize=64)
@@ -157,6 +176,23 @@ def _compose(name: str, overrides: Sequence[str], conf: Path) -> DictConfig:
         raise ConfigurationError(text) from error
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigurationError(sentence(error)) from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(_not_text(conf) or sentence(error)) from error
+
+
+def _not_text(conf: Path) -> str:
+    """A sentence about the first configuration file that is no UTF-8 text."""
+    for path in (folder / file for folder in folders(conf) for file in files(folder)):
+        try:
+            path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            line = error.object[: error.start].count(b"\n") + 1
+            byte = error.object[error.start]
+            return (
+                f"configuration files must be UTF-8 text, but line {line} of {path} has the byte 0x{byte:02x}: save "
+                "the file as UTF-8 (it may be Latin-1)"
+            )
+    return ""
 
 
 def _quoted(folder: Path) -> str:

@@ -50,13 +50,21 @@ class Symmetry:
             raise ValueError(f"symmetry kind must be one of {', '.join(get_args(Kind))}, got {self.kind!r}")
         for name in ("axis", "flip_axis"):
             raw = getattr(self, name)
-            value = np.asarray(raw, dtype=np.float64)
+            try:
+                value = np.asarray(raw, dtype=np.float64)
+            except (TypeError, ValueError):
+                value = np.zeros(0)
             if value.shape != (3,) or not np.isfinite(value).all() or np.linalg.norm(value) < 1e-9:
-                raise ValueError(f"symmetry {name} must be three finite numbers, not all zero, got {raw}")
+                raise ValueError(
+                    f"symmetry {name} must be three finite numbers, not all zero, as in [0, 0, 1]; got {raw!r}"
+                )
             unit = value / np.linalg.norm(value)
             object.__setattr__(self, name, (float(unit[0]), float(unit[1]), float(unit[2])))
-        if self.kind in ("cyclic", "dihedral") and (self.order < 2 or self.order != int(self.order)):
-            raise ValueError(f"{self.kind} symmetry must have a whole order of at least 2, got {self.order}")
+        is_number = isinstance(self.order, (int, float)) and not isinstance(self.order, bool)
+        if not is_number or (self.kind in ("cyclic", "dihedral") and (self.order < 2 or self.order != int(self.order))):
+            raise ValueError(f"{self.kind} symmetry must have a whole order of at least 2, got {self.order!r}")
+        if not isinstance(self.flip, bool):
+            raise ValueError(f"symmetry flip must be true or false, got {self.flip!r}")
         if self.kind == "dihedral" and abs(np.dot(self.axis, self.flip_axis)) > 1e-6:
             raise ValueError(f"flip_axis must be perpendicular to axis, got {self.flip_axis} and {self.axis}")
         object.__setattr__(self, "quaternions", tuple(tuple(float(v) for v in q) for q in self.quaternions))

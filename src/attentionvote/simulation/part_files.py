@@ -28,6 +28,12 @@ def load_part(
     title: Annotated[str, Setting("One line for people.", identity=Identity.ONCE)] = "",
     base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
     voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
+    near_symmetric: Annotated[
+        Any, Setting("Turns after which the part nearly looks like itself.", identity=Identity.NEVER)
+    ] = None,
+    mirror_image: Annotated[
+        Any, Setting("How alike the part and its mirror image are.", identity=Identity.NEVER)
+    ] = None,
 ) -> Part:
     """The part that ``conf/object/NAME.yaml`` describes.
 
@@ -40,6 +46,7 @@ def load_part(
         title: one line for people.
         base_radius: override of a scale setting in metres; conf/model takes it from here, not used by the part.
         voxel_size: the same for the voxel size.
+        near_symmetric, mirror_image: what ``make part`` found, for people and later stages; not used by the part.
 
     Raises:
         ValueError: with one sentence, on an unknown built-in, a broken mesh or an impossible symmetry.
@@ -48,8 +55,12 @@ def load_part(
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size), ("diameter", diameter)):
         if value is not None and not 0 < value <= 10:
             raise ValueError(f"{name}: {key} must be positive metres (at most 10) or null, got {value}")
+    for label, value, kind in (("near_symmetric", near_symmetric, list), ("mirror_image", mirror_image, Mapping)):
+        if value is not None and not isinstance(value, kind):
+            raise ValueError(f"{name}: {label} must be as `make part` writes it, got {value!r}: leave it out")
     from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
     from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface
+    from attentionvote.cad.part_claims import check_claims
 
     group = _symmetry(name, symmetry)
     if mesh.startswith(BUILTIN):
@@ -66,7 +77,9 @@ def load_part(
             " (a dataset's mesh comes with the dataset), or set ATTENTIONVOTE_DATA or object.mesh to where you have it"
         )
     vertices, faces = load_surface(mesh, units)
-    return Part(name, vertices, faces, diameter or largest_vertex_distance(vertices), group or Symmetry(), title)
+    part = Part(name, vertices, faces, diameter or largest_vertex_distance(vertices), group or Symmetry(), title)
+    check_claims(part)
+    return part
 
 
 def load_parts(
@@ -95,7 +108,12 @@ def load_parts(
     for key, value in (("base_radius", base_radius), ("voxel_size", voxel_size)):
         if value is not None and not 0 < value <= 10:
             raise ValueError(f"{name}: {key} must be positive metres (at most 10) or null, got {value}")
-    return PartSet(name, tuple(_member(name, key, settings) for key, settings in parts.items()), title)
+    members = tuple(_member(name, key, settings) for key, settings in parts.items())
+    from attentionvote.cad.part_claims import check_set
+
+    made = PartSet(name, members, title)
+    check_set(name, members)
+    return made
 
 
 def _member(name: str, key: str, settings: Part | Mapping[str, Any]) -> Part:
@@ -116,4 +134,7 @@ def _symmetry(name: str, symmetry: Mapping[str, Any] | Symmetry | None) -> Symme
     unknown = sorted(set(symmetry) - keys)
     if unknown:
         raise ValueError(f"{name}: symmetry must only have the keys {', '.join(sorted(keys))}, got '{unknown[0]}'")
-    return Symmetry(**dict(symmetry))
+    try:
+        return Symmetry(**dict(symmetry))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
