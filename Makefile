@@ -75,6 +75,9 @@ system:
 		echo "setup: a C compiler with headers (cc) is missing; install it (Debian: gcc libc6-dev)" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import ctypes; ctypes.CDLL("libstdc++.so.6")' 2>/dev/null || { \
 		echo "setup: the library libstdc++.so.6 is missing; install it (Debian: libstdc++6)" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import ctypes; ctypes.CDLL("libusb-1.0.so.0")' 2>/dev/null || { \
+		echo "setup: the library libusb-1.0.so.0, which Open3D loads, is missing;" \
+		"install it (Debian: libusb-1.0-0)" >&2; exit 1; }
 
 train: $(STAMP) ## Train, test and track a model: OBJECT=connecting_rod [PROCESSES=8] [ARGS="experiment=paper ..."]; resumes
 	@$(PY) $(several) pipelines/train.py $(object) $(ARGS)
