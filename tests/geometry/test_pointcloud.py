@@ -206,3 +206,20 @@ def test_an_image_of_many_rows_is_projected_as_one(monkeypatch: pytest.MonkeyPat
     np.testing.assert_array_equal(points, whole)
     np.testing.assert_array_equal(pixels, places)
     assert len(back_project(np.zeros((0, 7)), **CAMERA)[0]) == 0
+
+
+def test_normals_are_open3ds() -> None:
+    # A wavy sheet, noisy, seen from the origin: an implementation that shares no line with either of ours.
+    from open3d import geometry, utility
+
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(-0.2, 0.2, size=(2, 4000))
+    points = np.stack([x, y, 0.8 + 0.05 * np.sin(20 * x) * np.cos(15 * y)], axis=1) + rng.normal(
+        scale=2e-4, size=(4000, 3)
+    )
+    points = points.astype(np.float32)
+    cloud = geometry.PointCloud(utility.Vector3dVector(points.astype(np.float64)))
+    cloud.estimate_normals(geometry.KDTreeSearchParamKNN(30), fast_normal_computation=False)
+    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    cosine = np.einsum("ni,ni->n", estimate_normals(points, neighbors=30), np.asarray(cloud.normals))
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.1

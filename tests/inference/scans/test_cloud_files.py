@@ -179,3 +179,21 @@ def test_an_array_that_is_no_cloud_is_one_sentence(array: NDArray, message: str)
 def test_no_bytes_raise_anything_else(magic: bytes, rest: bytes) -> None:
     with suppress(InputError):
         read_cloud(magic + rest)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd"])
+@pytest.mark.parametrize(("ascii_", "compressed"), [(True, False), (False, False), (False, True)])
+def test_what_open3d_writes_is_read_to_the_same_points(
+    tmp_path: Path, suffix: str, ascii_: bool, compressed: bool
+) -> None:
+    from open3d import geometry, io, utility
+
+    points = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32).astype(np.float64)
+    cloud = geometry.PointCloud(utility.Vector3dVector(points))
+    cloud.colors = utility.Vector3dVector(np.random.default_rng(1).random((300, 3)))
+    cloud.normals = utility.Vector3dVector(points / np.linalg.norm(points, axis=1, keepdims=True))
+    path = tmp_path / f"cloud.{suffix}"
+    assert io.write_point_cloud(str(path), cloud, write_ascii=ascii_, compressed=compressed)
+    read = read_cloud(path.read_bytes(), suffix)
+    # As text Open3D writes six digits.
+    np.testing.assert_allclose(read, points, rtol=1e-5 if ascii_ else 0, atol=1e-6 if ascii_ else 0)
