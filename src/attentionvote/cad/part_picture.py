@@ -93,7 +93,8 @@ def _draw_frame(axes: Axes, part: Part, middle: Array, view_from_part: Array, ha
     for unit, colour, name in zip(np.eye(3), ("tab:red", "tab:green", "tab:blue"), "xyz", strict=True):
         end = origin + (view_from_part @ unit)[:2] * reach
         axes.plot(*np.stack([origin, end]).T, color=colour, linewidth=2)
-        axes.text(*(origin + 1.08 * (end - origin)), name, color=colour, clip_on=True)
+        x, y = origin + 1.08 * (end - origin)
+        axes.text(x, y, name, color=colour, clip_on=True)
     if part.symmetry.kind in ("cyclic", "dihedral", "revolution"):
         u = (view_from_part @ np.asarray(part.symmetry.axis))[:2] * half * 1.05
         axes.plot(*np.stack([origin - u, origin + u]).T, color="black", linestyle="--", linewidth=1.5)

@@ -77,11 +77,11 @@ def _adjacent(faces: Index) -> tuple[Index, Index, Index]:
 
 
 class _Corners(NamedTuple):
-    """The vertices of all facets, one facet after another: facet ``f`` has ``count[f]`` from ``start[f]`` on."""
+    """The vertices of all facets, one facet after another: facet ``f`` has ``number[f]`` from ``start[f]`` on."""
 
     vertex: Index
     start: Index
-    count: Index
+    number: Index
 
     @classmethod
     def of(cls, facet: Index, faces: Index) -> _Corners:
@@ -92,7 +92,7 @@ class _Corners(NamedTuple):
 
 def _widths(vertices: Array, edges: Index, corners: _Corners, facets: Index) -> Array:
     """Width ``(E,)`` of each facet across its edge ``(E, 2)``; infinite for a plane of many corners."""
-    count = np.where(corners.count[facets] > MOST_CORNERS, 1, corners.count[facets])
+    count = np.where(corners.number[facets] > MOST_CORNERS, 1, corners.number[facets])
     begin = np.cumsum(count) - count
     each = np.repeat(np.arange(len(edges)), count)
     those = corners.vertex[corners.start[facets][each] + np.arange(len(each)) - begin[each]]
@@ -101,4 +101,4 @@ def _widths(vertices: Array, edges: Index, corners: _Corners, facets: Index) -> 
     out = vertices[those] - vertices[edges[each, 0]]
     out = out - np.einsum("ki,ki->k", out, along[each])[:, None] * along[each]
     width = np.maximum.reduceat(np.linalg.norm(out, axis=1), begin) if len(each) else np.zeros(0)
-    return np.where(corners.count[facets] > MOST_CORNERS, np.inf, width)
+    return np.where(corners.number[facets] > MOST_CORNERS, np.inf, width)

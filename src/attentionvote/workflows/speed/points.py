@@ -107,7 +107,7 @@ def normals(material: Material) -> Contest:
     references: dict[str, Callable[[], Any]] = {"scipy": lambda: estimate_normals_reference(cloud, cloud, neighbors)}
     absent: tuple[str, ...] = ()
     try:
-        import open3d  # type: ignore[import-not-found]
+        import open3d
     except (ImportError, OSError):
         absent = (OPEN3D,)
     else:
