@@ -12,6 +12,12 @@ from scipy.spatial.distance import pdist
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 FORMATS = (".stl", ".obj", ".ply", ".glb")
+# Of these the unit is no guess.
+UNIT_KNOWN = {
+    ".glb": "a GLB is in metres by definition",
+    ".step": "a STEP file says its unit",
+    ".stp": "a STEP file says its unit",
+}
 SMALLEST_EXTENT, LARGEST_EXTENT = 0.001, 5.0
 
 
@@ -37,7 +43,7 @@ def load_surface(path: str | Path, units: str = "m") -> tuple[NDArray[np.float64
         raise ValueError(f"mesh file must end in one of {', '.join(FORMATS)}, got '{path.name}'")
     if not path.is_file():
         raise FileNotFoundError(f"mesh file '{path}' does not exist")
-    mesh = _read(path)
+    mesh = read_mesh(path)
     mesh.apply_scale(METRES_PER_UNIT[units])
     if not np.isfinite(mesh.vertices).all():
         raise ValueError(
@@ -45,7 +51,7 @@ def load_surface(path: str | Path, units: str = "m") -> tuple[NDArray[np.float64
         )
     check_size(mesh.extents, units, path.name)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces())
+    _leave_out_slivers(mesh)
     mesh.remove_unreferenced_vertices()
     _check_solid(mesh, path.name)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
@@ -60,6 +66,15 @@ def check_size(extents: NDArray[np.float64], units: str, name: str) -> None:
     largest = float(extents.max())
     if SMALLEST_EXTENT <= largest <= LARGEST_EXTENT:
         return
+    suffix = Path(name).suffix.lower()
+    if suffix in UNIT_KNOWN:
+        kind = UNIT_KNOWN[suffix]
+        plain = largest / METRES_PER_UNIT[units]
+        advice = f"{kind}: export it again in its true size"
+        if units != "m" and SMALLEST_EXTENT <= plain <= LARGEST_EXTENT:
+            advice = f"{kind}: leave units out ({plain:.4g} m)"
+        said = f" with units={units}" if units != "m" else ""
+        raise ValueError(f"mesh '{name}' must be between 1 mm and 5 m long, got {largest:.4g} m{said}; {advice}")
     size_of = {u: largest / METRES_PER_UNIT[units] * METRES_PER_UNIT[u] for u in METRES_PER_UNIT}
     # The best guess is the unit that brings the part nearest to a hand's width (geometric mean of the limits).
     best = min(size_of, key=lambda u: abs(np.log(size_of[u] / 0.1)))
@@ -84,7 +99,12 @@ def largest_vertex_distance(vertices: NDArray[np.float64]) -> float:
     return max(float(np.linalg.norm(corners - c, axis=1).max()) for c in corners)
 
 
-def _read(path: Path) -> trimesh.Trimesh:
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """The triangles of a mesh file as they are in it; the nodes of a scene where its transforms place them.
+
+    Raises:
+        ValueError: with one sentence, when it cannot be read or holds no surface.
+    """
     try:
         mesh = trimesh.load_mesh(path, process=False)  # its repairs would hide NaN and duplicate faces
         if isinstance(mesh, trimesh.Scene):
@@ -95,6 +115,22 @@ def _read(path: Path) -> trimesh.Trimesh:
         count = len(mesh.faces) if isinstance(mesh, trimesh.Trimesh) else 0
         raise ValueError(f"mesh '{path.name}' must hold a surface of at least 4 triangles, got {count}")
     return mesh
+
+
+def _leave_out_slivers(mesh: trimesh.Trimesh) -> None:
+    """Leave out triangles thinner than 10 nm, unless that opens a closed surface: then only those of two corners."""
+    is_fat = mesh.nondegenerate_faces()
+    if is_fat.all():
+        return
+    has_three = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(axis=1)
+    if not _is_closed(mesh.faces[is_fat]) and _is_closed(mesh.faces[has_three]):
+        is_fat = has_three
+    mesh.update_faces(is_fat)
+
+
+def _is_closed(faces: NDArray[np.int64]) -> bool:
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
 
 
 def _check_solid(mesh: trimesh.Trimesh, name: str) -> None:

@@ -1,6 +1,6 @@
 """Writes the STEP files of this folder; needs cadquery-ocp-novtk, which the project does not install.
 
-    python3.11 -m venv /tmp/ocp && /tmp/ocp/bin/pip install cadquery-ocp-novtk && /tmp/ocp/bin/python make_step_files.py
+python3.11 -m venv /tmp/ocp && /tmp/ocp/bin/pip install cadquery-ocp-novtk && /tmp/ocp/bin/python make_step_files.py
 """
 
 from math import cos, pi, sin
