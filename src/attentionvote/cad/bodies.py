@@ -6,7 +6,7 @@ Lengths are shares of the diameter.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ def body_of(vertices: Array, faces: Ints, solid: Ints) -> tuple[Ints, Ints]:
     if count == 1:
         return body, np.zeros((0, 2), dtype=np.int64)
     low, high, volume = _measures(vertices, faces[solid >= 0], solid[solid >= 0], count)
-    shapes = [None] * count
+    shapes: list[Any] = [None] * count
     pairs = []
     for i in range(count):
         near = np.flatnonzero(((low - LARGEST_MOVE <= high[i]) & (high + LARGEST_MOVE >= low[i])).all(axis=1))
@@ -182,7 +182,7 @@ def _parents(vertices: Array, faces: Ints, shell: Ints, volume: Array, low: Arra
     return parent
 
 
-def _manifold(vertices: Array, faces: Ints) -> object:
+def _manifold(vertices: Array, faces: Ints) -> Any:
     from manifold3d import Error, Manifold, Mesh64
 
     used, compact = np.unique(faces, return_inverse=True)

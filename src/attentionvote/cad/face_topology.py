@@ -167,10 +167,10 @@ def _pairs_about(
         members = np.roll(members, -shift)
         return list(zip(members[::2], members[1::2], strict=True))
     depth = np.cumsum(np.where(runs_up, -1, 1))
-    members, runs_up = (np.roll(x, -(int(np.argmin(depth)) + 1)) for x in (members, runs_up))
+    first = -(int(np.argmin(depth)) + 1)
     waiting: list[int] = []
     pairs = []
-    for member, is_up in zip(members, runs_up, strict=True):
+    for member, is_up in zip(np.roll(members, first), np.roll(runs_up, first), strict=True):
         if is_up:
             pairs.append((waiting.pop(), int(member)))
         else:

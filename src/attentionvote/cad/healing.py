@@ -18,16 +18,21 @@ from attentionvote.cad.vertex_merging import ZIPPED, distinct, merged, zipped
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SET_APART = 2e-5  # surfaces that touch along an edge are moved into their material by this
 MOST_LEAVES = 12  # patches of a surface that are tried as walls inside or fins outside
 
 
 class CannotHeal(ValueError):
-    """A surface that would have to be invented; ``where`` ``(N, 2, 3)`` are the lines to look at."""
+    """A surface that would have to be invented.
+
+    Args:
+        message: what is wrong, to be put behind the file's name.
+        where: ``(N, 2, 3)`` lines to look at, in shares of D; ``metres`` the same in the file's frame, once known.
+    """
 
     def __init__(self, message: str, where: Array) -> None:
         super().__init__(message)
         self.where = where
+        self.metres: Array | None = None
 
 
 @dataclass
@@ -38,15 +43,19 @@ class Changes:
         notes: what, for people.
         moved: how far the surface went, a share of D.
         removed: ``(R, 3, 3)`` triangles left out, which must be inside of what is left, or on it.
+        where: ``(N, 2, 3)`` lines at the largest move, as far as they are known.
     """
 
     notes: list[str] = field(default_factory=list)
     moved: float = 0.0
     removed: list[Array] = field(default_factory=list)
+    where: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
 
-    def note(self, text: str, moved: float = 0.0) -> None:
-        """Add what was done, and how far it moved the surface."""
+    def note(self, text: str, moved: float = 0.0, where: Array | None = None) -> None:
+        """Add what was done, how far it moved the surface, and where."""
         self.notes.append(text)
+        if moved > self.moved and where is not None:
+            self.where = where
         self.moved = max(self.moved, moved)
 
 
@@ -80,8 +89,10 @@ def healed(vertices: Array, faces: Ints, changes: Changes, length: float) -> Who
     stand, moved, count = merged(vertices)
     faces = stand[faces]
     if count:
+        lines = np.stack([vertices, vertices[stand]], axis=1)
+        far = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) > moved / 2
         changes.note(
-            f"merged {count} {_plural(count, 'vertex', 'vertices')} up to {_short(moved * length)} apart", moved
+            f"merged {counted(count, 'vertex', 'vertices')} up to {_short(moved * length)} apart", moved, lines[far]
         )
     faces = _without_copies(vertices, faces, changes)
     vertices, faces = _zip_cracks(vertices, faces, changes, length)
@@ -100,34 +111,12 @@ def settled(vertices: Array, faces: Ints) -> Whole:
     return _whole(vertices, faces, mate)
 
 
-def set_apart(whole: Whole) -> tuple[Array, Ints, int]:
-    """Vertices and faces of which no two surfaces share a place, by moving both into their material; how many edges.
-
-    A file has no other way to say that two edges in one place are two.
-    """
-    source, faces = whole.source, whole.faces
-    edges = edges_of(source[faces])
-    touching = int((edges.uses > 2).sum())
-    if not touching:
-        used, compact = np.unique(faces, return_inverse=True)
-        return whole.vertices[used], compact.reshape(-1, 3), 0
-    copies = np.bincount(source, minlength=len(source))
-    moved = np.flatnonzero(copies[source] > 1)
-    vertices = whole.vertices.copy()
-    vertices[moved] -= SET_APART * _outward(vertices, faces)[moved]
-    vertices, faces = _split_pinched(vertices, faces)
-    used, compact = np.unique(faces, return_inverse=True)
-    return vertices[used], compact.reshape(-1, 3), touching
-
-
 def _without_copies(vertices: Array, faces: Ints, changes: Changes) -> Ints:
     result = distinct(faces)
     if result.repeated:
-        changes.note(f"left out {result.repeated} {_plural(result.repeated, 'copy', 'copies')} of faces")
+        changes.note(f"left out {counted(result.repeated, 'copy', 'copies')} of faces")
     if len(result.removed):
-        changes.note(
-            f"left out {len(result.removed)} {_plural(len(result.removed), 'pair', 'pairs')} of opposite faces"
-        )
+        changes.note(f"left out {counted(len(result.removed), 'pair', 'pairs')} of opposite faces")
         changes.removed.append(vertices[result.removed])
     if len(result.faces) < 4:
         raise CannotHeal(f"encloses nothing: {len(result.faces)} faces are left", vertices[faces[:, :2]])
@@ -163,7 +152,9 @@ def _without_leaves(vertices: Array, faces: Ints, changes: Changes) -> Ints:
         mate = np.full(3 * len(faces), -1)
         mate[order[two]], mate[order[two + 1]] = order[two + 1], order[two]
         patch = face_labels(mate)
-        area = np.linalg.norm(np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))), axis=1)
+        corners = vertices[faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(normal, axis=1)
         areas = np.bincount(patch, area)
         rim = edges.uses[edges.of]
         rim_patch = np.repeat(patch, 3)
@@ -195,6 +186,11 @@ def _close(vertices: Array, faces: Ints, changes: Changes) -> tuple[Array, Ints,
             count = int(is_open.sum())
             raise CannotHeal(f"is a sheet and no solid: {count} of its edges are open", _lines(vertices, faces, mate))
         result = lids(vertices, faces, mate)
+        if len(result.refused) and (stray := _stray_sheets(vertices, faces, mate, result.refused)).any():
+            changes.note(f"left out {counted(int(stray.sum()), 'face', 'faces')} of open sheets")
+            changes.removed.append(vertices[faces[stray]])
+            faces = faces[~stray]
+            continue
         if len(result.refused) or not result.holes:
             lines = vertices[result.refused] if len(result.refused) else _lines(vertices, faces, mate)
             many = int((edges_of(faces).uses > 2).sum())
@@ -209,8 +205,19 @@ def _close(vertices: Array, faces: Ints, changes: Changes) -> tuple[Array, Ints,
     else:
         raise CannotHeal("must be watertight, got edges that no lid closes", _lines(vertices, faces, mate))
     if holes:
-        changes.note(f"closed {holes} {_plural(holes, 'hole', 'holes')} ({opened} open edges)", off)
+        changes.note(f"closed {counted(holes, 'hole', 'holes')} ({opened} open edges)", off)
     return vertices, faces, mate
+
+
+def _stray_sheets(vertices: Array, faces: Ints, mate: Ints, rim: Ints) -> NDArray[np.bool_]:
+    """The faces ``(F,)`` of surfaces that cannot be closed, beside larger ones that can."""
+    label = face_labels(mate)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    starts = faces.ravel()[np.flatnonzero(mate < 0)]
+    is_bad = np.isin(label, label[np.flatnonzero(mate < 0)[np.isin(starts, rim)] // 3])
+    area = np.linalg.norm(normal, axis=1)
+    return is_bad if area[is_bad].sum() < area[~is_bad].sum() else np.zeros(len(faces), dtype=bool)
 
 
 def _whole(vertices: Array, faces: Ints, mate: Ints) -> Whole:
@@ -218,61 +225,14 @@ def _whole(vertices: Array, faces: Ints, mate: Ints) -> Whole:
     return Whole(vertices[source], faces, source, face_labels(mate))
 
 
-def _outward(vertices: Array, faces: Ints) -> Array:
-    """Unit normals ``(V, 3)``, each face weighted by its angle there; zero where there is no face."""
-    result = np.zeros_like(vertices)
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.where(size > 0, size, 1.0)
-    for i in range(3):
-        one, other = (corners[:, (i + k) % 3] - corners[:, i] for k in (1, 2))
-        angle = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.einsum("ni,ni->n", one, other))
-        np.add.at(result, faces[:, i], normal * angle[:, None])
-    size = np.linalg.norm(result, axis=1, keepdims=True)
-    return result / np.where(size > 1e-9, size, 1.0)
-
-
-def _split_pinched(vertices: Array, faces: Ints) -> tuple[Array, Ints]:
-    """An edge of four faces between two vertices that all of them share: a vertex of its own in the middle for each pair."""
-    edges = edges_of(faces)
-    if not (edges.uses > 2).any():
-        return vertices, faces
-    faces, mate = paired(vertices, faces)
-    edges = edges_of(faces)
-    first = np.flatnonzero((edges.uses[edges.of] > 2) & (np.arange(len(mate)) < mate))
-    done: set[int] = set()
-    added, extra, gone = [], [], []
-    for one in first.tolist():
-        other = int(mate[one])
-        if one // 3 in done or other // 3 in done:
-            continue
-        done |= {one // 3, other // 3}
-        a, b = (faces.ravel()[h] for h in (one, other))
-        normal = sum(
-            np.cross(*(vertices[faces[f, i]] - vertices[faces[f, 0]] for i in (1, 2))) for f in (one // 3, other // 3)
-        )
-        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
-        middle = len(vertices) + len(added)
-        added.append((vertices[a] + vertices[b]) / 2 - SET_APART * normal)
-        for half in (one, other):
-            f, i = divmod(half, 3)
-            p, q, r = (int(faces[f, (i + k) % 3]) for k in range(3))
-            gone.append(f)
-            extra += [(p, middle, r), (middle, q, r)]
-    if not added:
-        return vertices, faces
-    faces = np.concatenate([np.delete(faces, gone, axis=0), np.array(extra, dtype=np.int64)])
-    return _split_pinched(np.concatenate([vertices, np.array(added)]), faces)
-
-
 def _lines(vertices: Array, faces: Ints, mate: Ints) -> Array:
     half = np.flatnonzero(mate < 0)
     return vertices[np.stack([faces.ravel()[half], np.roll(faces, -1, axis=1).ravel()[half]], axis=1)]
 
 
-def _plural(count: int, one: str, many: str) -> str:
-    return one if count == 1 else many
+def counted(count: int, one: str, many: str) -> str:
+    """A number with its noun."""
+    return f"{count} {one if count == 1 else many}"
 
 
 def _short(millimetres: float) -> str:

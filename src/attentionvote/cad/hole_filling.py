@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.cad.face_topology import edges_of, following
+from attentionvote.cad.face_topology import edges_of
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -83,12 +83,16 @@ def _loops(faces: Ints, mate: Ints) -> list[list[int]]:
             place[vertex] = len(path)
             path.append(here)
             # On to the next open half-edge about the end of this one, within the surface.
-            here = int(following(np.int64(here)))
+            here = _after(here)
             while mates[here] >= 0:
-                here = int(following(np.int64(mates[here])))
+                here = _after(mates[here])
         if path:
             loops.append(path)
     return [loop for loop in loops if len(loop) > 2]
+
+
+def _after(half_edge: int) -> int:
+    return half_edge // 3 * 3 + (half_edge + 1) % 3
 
 
 def _near_open(faces: Ints, mate: Ints) -> tuple[Ints, Ints]:
@@ -165,9 +169,9 @@ def _best_lid(points: Array, corners: Ints, known: set[int], count: int) -> Ints
     while stack:
         i, j = stack.pop()
         if j - i > 1:
-            k = int(split[i, j])
-            result.append((i, k, j))
-            stack += [(i, k), (k, j)]
+            middle = int(split[i, j])
+            result.append((i, middle, j))
+            stack += [(i, middle), (middle, j)]
     return corners[np.array(result)]
 
 

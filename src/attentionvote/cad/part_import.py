@@ -11,12 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from attentionvote.cad.bodies import body_of, gap, inside, solids_of, united
-from attentionvote.cad.healing import CannotHeal, Changes, Whole, healed, set_apart, settled
+from attentionvote.cad.assembly import as_one, assembly_question, listed, told_apart
+from attentionvote.cad.bodies import inside
+from attentionvote.cad.healing import CannotHeal, Changes, counted, healed
 from attentionvote.cad.hole_filling import LARGEST_MOVE
 from attentionvote.cad.mesh_file import FORMATS, METRES_PER_UNIT, check_size, largest_vertex_distance, read_mesh
 from attentionvote.cad.step_file import STEP_FORMATS, read_step
 from attentionvote.cad.surface_distance import SurfaceDistance
+from attentionvote.cad.touching_edges import SET_APART, set_apart
+from attentionvote.cad.vertex_merging import merged
 from attentionvote.part import uniform_points
 
 Array = NDArray[np.float64]
@@ -24,7 +27,6 @@ Ints = NDArray[np.int64]
 
 NOTHING = "nothing to heal"
 ALL = 0  # as the body: all of them are one part
-MOST_NAMED = 6
 REMOVED_POINTS = 200
 
 
@@ -93,72 +95,38 @@ def _read(path: Path, units: str | None) -> tuple[Array, Ints]:
 
 
 def _imported(vertices: Array, faces: Ints, name: str, body: int | None) -> ImportedPart:
-    used = np.unique(faces)
-    diameter = largest_vertex_distance(vertices[used])
-    centre = (vertices[used].max(axis=0) + vertices[used].min(axis=0)) / 2
+    """The part in metres; works on it in shares of its diameter, about its middle."""
+    used = vertices[np.unique(faces)]
+    diameter = largest_vertex_distance(used)
+    centre = (used.max(axis=0) + used.min(axis=0)) / 2
     changes = Changes()
-    scaled = (vertices - centre) / diameter
-    whole = healed(scaled, faces, changes, diameter * 1000)
     try:
-        solids = solids_of(whole.vertices, whole.faces, whole.shell)
-        if solids.empty:
-            is_empty = solids.solid < 0
-            changes.note(
-                f"left out {solids.empty} {'surface' if solids.empty == 1 else 'surfaces'} that enclose nothing"
-            )
-            changes.removed.append(whole.vertices[whole.faces[is_empty]])
-        is_kept = solids.solid >= 0
-        kept, solid = solids.faces[is_kept], solids.solid[is_kept]
-        body_number, touching = body_of(whole.vertices, kept, solid)
-        bodies = [_size(whole.vertices, kept[body_number[solid] == k], diameter) for k in range(body_number.max() + 1)]
-        if len(bodies) > 1 and body is None:
-            raise ValueError(_assembly(whole.vertices, kept, body_number[solid], diameter, bodies))
-        if body is not None and not 0 <= body <= len(bodies):
-            raise ValueError(f"must have the body that is asked for: BODY={body}, got {_listed(bodies)}")
-        if body and len(bodies) > 1:
+        whole = healed((vertices - centre) / diameter, faces, changes, diameter * 1000)
+        split = told_apart(whole, changes, diameter)
+        count = len(split.sizes)
+        if body is not None and not 0 <= body <= count:
+            raise ValueError(f"mesh '{name}' has no BODY={body}, got {listed(split.sizes)}")
+        if body is None and count > 1:
+            raise ValueError(f"mesh '{name}' {assembly_question(split, diameter)}")
+        if body and count > 1:
             # Again from the file's own triangles: what is a rounding in the whole may be a feature of this body.
-            ids = np.unique(whole.source[kept[body_number[solid] == body - 1]])
-            chosen = _faces_at(scaled, faces, ids)
-            result = _imported(vertices, chosen, name, ALL)
-            note = f"body {body} of {len(bodies)}"
-            report = note if result.report == NOTHING else f"{note}; {result.report}"
-            return result._replace(report=report, bodies=bodies)
-        if solids.turned:
-            changes.note(f"turned {solids.turned} {'surface' if solids.turned == 1 else 'surfaces'} inside out")
-        if solids.cavities:
-            changes.note(f"kept {solids.cavities} {'cavity' if solids.cavities == 1 else 'cavities'}")
-        if len(touching):
-            count = len(np.unique(touching))
-            points, joined, twice = united(whole.vertices, kept, solid)
-            share = twice / max(_volume(points, joined), 1e-300)
-            kind = (
-                f"overlapping solids ({share:.1%} of the volume was there twice)" if share > 1e-6 else "touching solids"
-            )
-            changes.note(f"united {count} {kind}")
-            whole = settled(points, joined)
-        else:
-            used, compact = np.unique(kept, return_inverse=True)
-            whole = Whole(whole.vertices, kept, whole.source, whole.shell[is_kept])
-    except CannotHeal:
+            stand = merged((vertices - centre) / diameter)[0]
+            is_there = np.isin(np.arange(len(vertices)), whole.source[split.faces[split.body == body - 1]])
+            result = _imported(vertices, faces[is_there[stand[faces]].any(axis=1)], name, ALL)
+            report = f"body {body} of {count}" + (f"; {result.report}" if result.report != NOTHING else "")
+            return result._replace(report=report, bodies=split.sizes)
+        points, triangles, apart = set_apart(as_one(whole, split, changes))
+        if apart:
+            changes.note(f"set {counted(apart, 'touching edge', 'touching edges')} apart", SET_APART)
+        _check_removed(points, triangles, changes)
+        if changes.moved > LARGEST_MOVE:
+            raise CannotHeal(f"would move by {changes.moved:.2%} of its diameter", changes.where)
+    except CannotHeal as error:
+        if error.metres is None:
+            error.metres = error.where * diameter + centre
         raise
-    except ValueError as error:
-        raise ValueError(f"mesh '{name}' {error}") from error
-    points, triangles, apart = set_apart(whole)
-    if apart:
-        changes.note(f"set {apart} touching {'edge' if apart == 1 else 'edges'} apart", 2e-5)
-    _check_removed(points, triangles, changes)
-    if changes.moved > LARGEST_MOVE:
-        raise CannotHeal(f"would move by {changes.moved:.2%} of its diameter", points[triangles[:0, :2]])
     report = ", ".join(changes.notes) or NOTHING
-    return ImportedPart(points * diameter + centre, triangles, report, changes.moved * diameter, bodies)
-
-
-def _faces_at(vertices: Array, faces: Ints, ids: Ints) -> Ints:
-    from attentionvote.cad.vertex_merging import merged
-
-    is_there = np.zeros(len(vertices), dtype=bool)
-    is_there[ids] = True
-    return faces[is_there[merged(vertices)[0][faces]].any(axis=1)]
+    return ImportedPart(points * diameter + centre, triangles, report, changes.moved * diameter, split.sizes)
 
 
 def _check_removed(vertices: Array, faces: Ints, changes: Changes) -> None:
@@ -179,54 +147,13 @@ def _check_removed(vertices: Array, faces: Ints, changes: Changes) -> None:
                          "from the solid", removed[:, [0, 1]])  # fmt: skip
 
 
-def _volume(vertices: Array, faces: Ints) -> float:
-    return float(np.linalg.det(vertices[faces]).sum()) / 6
-
-
-def _size(vertices: Array, faces: Ints, diameter: float) -> str:
-    extent = np.ptp(vertices[np.unique(faces)], axis=0) * diameter * 1000
-    return " x ".join(f"{e:.1f}" for e in extent) + " mm"
-
-
-def _listed(bodies: list[str]) -> str:
-    more = f" and {len(bodies) - MOST_NAMED} more" if len(bodies) > MOST_NAMED else ""
-    what = "1 body" if len(bodies) == 1 else f"{len(bodies)} bodies"
-    return f"{what}: " + ", ".join(f"BODY={i} ({b})" for i, b in enumerate(bodies[:MOST_NAMED], 1)) + more
-
-
-def _assembly(vertices: Array, faces: Ints, body: Ints, diameter: float, bodies: list[str]) -> str:
-    first = faces[body == 0]
-    away = min(gap(vertices, first, faces[body == k]) for k in range(1, min(len(bodies), MOST_NAMED + 1)))
-    millimetres = away * diameter * 1000
-    names = [f"BODY={i} ({b})" for i, b in enumerate(bodies[:MOST_NAMED], 1)]
-    if len(bodies) > MOST_NAMED:
-        names.append(f"another up to BODY={len(bodies)}")
-    alike = ""
-    if len(bodies) == 2:
-        one, two = (_alike(vertices, faces[body == k]) for k in (0, 1))
-        alike = " of one size (copies, or mirror images)" if np.allclose(one, two, rtol=1e-3) else ""
-    return (
-        f"holds {len(bodies)} bodies{alike} {millimetres:.3g} mm apart: an assembly? {', '.join(names[:-1])} or "
-        f"{names[-1]} picks one, BODY=0 takes all as one part"
-    )
-
-
-def _alike(vertices: Array, faces: Ints) -> Array:
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    middle = vertices[np.unique(faces)].mean(axis=0)
-    return np.array([_volume(vertices - middle, faces), area])
-
-
 def _refusal(error: CannotHeal, name: str, vertices: Array, faces: Ints, picture: Path | None) -> str:
     seen = ""
-    if picture is not None and len(error.where):
+    if picture is not None and error.metres is not None and len(error.metres):
         from attentionvote.cad.refusal_picture import write_refusal
         from attentionvote.files import whole
 
-        used = vertices[np.unique(faces)]
-        diameter = largest_vertex_distance(used)
-        where = error.where * diameter + (used.max(axis=0) + used.min(axis=0)) / 2
+        where = error.metres
         whole(picture, lambda path: write_refusal(vertices[faces], where, f"{name} {error}", path))
         seen = f"; {picture} shows where"
     return f"mesh '{name}' {error}{seen}; close it in the CAD program and export it again, or export STEP"

@@ -54,7 +54,7 @@ def read_step(path: Path, units: str | None = None) -> tuple[NDArray[np.float64]
 
 
 def length_units(text: str) -> set[str]:
-    """The units of length in which the shapes of a STEP file are: m, cm, mm, inch, or another name as the file has it."""
+    """The units of length of the shapes in a STEP file: m, cm, mm, inch, or another as the file names it."""
     entities = dict(_LENGTH.findall(text))
     used = {i for context in _CONTEXT.findall(text) for i in re.findall(r"#(\d+)", context)}
     result = set()

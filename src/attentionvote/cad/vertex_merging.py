@@ -1,4 +1,4 @@
-"""Vertices that are one but for rounding, and the faces that are none afterwards: what files without shared vertices need.
+"""Vertices that are one but for rounding, and faces that are there twice or not at all.
 
 Lengths are shares of the diameter.
 """
@@ -57,7 +57,7 @@ def merged(vertices: Array, tolerance: float = MERGED) -> tuple[Ints, float, int
 
 
 def zipped(vertices: Array, faces: Ints, tolerance: float) -> tuple[Array, Ints, float]:
-    """Vertices and faces with the vertices of open edges joined to their neighbours across a crack, and the largest move.
+    """Vertices and faces with the vertices of open edges joined across cracks, and the largest move.
 
     Neighbours along an open edge are not across it.
     """
@@ -68,16 +68,16 @@ def zipped(vertices: Array, faces: Ints, tolerance: float) -> tuple[Array, Ints,
     if not len(pairs):
         return vertices, faces, 0.0
     count = len(vertices)
-    low, high = np.sort(rim[pairs], axis=1).T
-    joined = np.isin(low * count + high, edges.ends[:, 0] * count + edges.ends[:, 1])
+    ends = np.sort(rim[pairs], axis=1)
+    joined = np.isin(ends @ [count, 1], edges.ends @ [count, 1])
     pairs = pairs[~joined]
     if not len(pairs):
         return vertices, faces, 0.0
     first = _first_of_cluster(pairs, len(rim))
     weight = np.bincount(first, minlength=len(rim))
-    middle = np.stack([np.bincount(first, vertices[rim, i], len(rim)) for i in range(3)], axis=1)
-    middle = middle[first] / weight[first, None]
-    moves = float(np.linalg.norm(vertices[rim] - middle, axis=1).max())
+    total = np.stack([np.bincount(first, vertices[rim, i], len(rim)) for i in range(3)], axis=1)
+    middle: Array = total[first] / weight[first, None]
+    moves = float(np.linalg.norm(vertices[rim] - middle, axis=1).max(initial=0.0))
     vertices = vertices.copy()
     vertices[rim] = middle
     stand = np.arange(count)
@@ -88,8 +88,8 @@ def zipped(vertices: Array, faces: Ints, tolerance: float) -> tuple[Array, Ints,
 def distinct(faces: Ints) -> Distinct:
     """``faces`` ``(F, 3)`` without those of two corners, copies, and pairs of opposite orientation.
 
-    A face of two corners has its two neighbours on the same edge: leaving it out opens nothing, and neither does leaving
-    out an opposite pair. A body of which every face is there from both sides is kept once.
+    A face of two corners has its two neighbours on the same edge: leaving it out opens nothing, and neither does
+    leaving out an opposite pair. A body of which every face is there from both sides is kept once.
     """
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     ordered = np.sort(faces, axis=1)
