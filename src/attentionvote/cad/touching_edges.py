@@ -1,4 +1,4 @@
-"""Surfaces that touch along an edge, told apart in a way that a file can say: by moving both a little into their material.
+"""Surfaces that touch along an edge, told apart as a file can say it: both are moved a little into their material.
 
 Lengths are shares of the diameter.
 """
