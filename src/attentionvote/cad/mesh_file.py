@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cdist, pdist
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 FORMATS = (".stl", ".obj", ".ply", ".glb")
@@ -18,6 +18,8 @@ UNIT_KNOWN = {
     ".step": "a STEP file says its unit",
     ".stp": "a STEP file says its unit",
 }
+FEW_CORNERS = 3000  # of a hull: so many are compared each with each
+CORNERS_IN_A_GROUP = 64
 SMALLEST_EXTENT, LARGEST_EXTENT = 0.001, 5.0
 
 
@@ -94,9 +96,36 @@ def largest_vertex_distance(vertices: NDArray[np.float64]) -> float:
         corners = vertices[ConvexHull(vertices).vertices]
     except QhullError:  # flat or tiny: no hull, all pairs
         corners = vertices
-    if len(corners) <= 3000:
+    if len(corners) <= FEW_CORNERS:
         return float(pdist(corners).max())
-    return max(float(np.linalg.norm(corners - c, axis=1).max()) for c in corners)
+    return _largest_of_many(corners)
+
+
+def _largest_of_many(corners: NDArray[np.float64]) -> float:
+    """The same for thousands of corners: only groups that may lie farther apart than any pair so far are compared."""
+    groups = [np.arange(len(corners))]
+    while len(groups[0]) > CORNERS_IN_A_GROUP:  # halved along their longest side, all of them at once
+        halves = []
+        for group in groups:
+            along = corners[group, np.argmax(np.ptp(corners[group], axis=0))]
+            order = group[np.argsort(along, kind="stable")]
+            halves += [order[len(order) // 2 :], order[: len(order) // 2]]
+        groups = halves
+    centres = np.array([corners[g].mean(axis=0) for g in groups])
+    radii = np.array([np.linalg.norm(corners[g] - m, axis=1).max() for g, m in zip(groups, centres, strict=True)])
+    first, second = np.triu_indices(len(groups))
+    reach = np.linalg.norm(centres[first] - centres[second], axis=1) + radii[first] + radii[second]
+    best = 0.0
+    for pair in np.argsort(-reach):
+        if reach[pair] < best * (1 - 1e-12):
+            break
+        one, other = groups[first[pair]], groups[second[pair]]
+        distance = cdist(corners[one], corners[other])
+        # Of all but equal pairs each is measured as it always was: D is part of digests.
+        i, j = np.nonzero(distance >= max(best, float(distance.max())) * (1 - 1e-12))
+        if len(i):
+            best = max(best, float(np.linalg.norm(corners[one[i]] - corners[other[j]], axis=1).max()))
+    return best
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:

@@ -72,6 +72,13 @@ def import_part(
         raise ValueError(_refusal(error, path.name, vertices, faces, picture)) from error
 
 
+def _corners_of(vertices: Array, faces: Ints) -> Array:
+    """The vertices ``(U, 3)`` that faces have: some files hold others."""
+    is_used = np.zeros(len(vertices), dtype=bool)
+    is_used[faces] = True
+    return vertices[is_used]
+
+
 def _read(path: Path, units: str | None) -> tuple[Array, Ints]:
     if units is not None and units not in METRES_PER_UNIT:
         raise ValueError(f"units must be one of {', '.join(METRES_PER_UNIT)}, got {units!r}")
@@ -89,14 +96,14 @@ def _read(path: Path, units: str | None) -> tuple[Array, Ints]:
     bad = int((~np.isfinite(vertices)).sum())
     if bad:
         raise ValueError(f"mesh '{path.name}' must have finite vertices, got {bad} NaN or inf")
-    used = vertices[np.unique(faces)]
+    used = _corners_of(vertices, faces)
     check_size(used.max(axis=0) - used.min(axis=0), units or "m", path.name)
     return vertices, faces
 
 
 def _imported(vertices: Array, faces: Ints, name: str, body: int | None) -> ImportedPart:
     """The part in metres; works on it in shares of its diameter, about its middle."""
-    used = vertices[np.unique(faces)]
+    used = _corners_of(vertices, faces)
     diameter = largest_vertex_distance(used)
     centre = (used.max(axis=0) + used.min(axis=0)) / 2
     changes = Changes()
