@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +183,29 @@ def _check_solid(mesh: trimesh.Trimesh, name: str) -> None:
         raise ValueError(f"mesh '{name}' must enclose a volume, got {abs(volume):.3g} m^3")
     if volume < 0:
         mesh.invert()
+
+
+def check_written(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
+    """Refuse a surface ``(V, 3)``, ``(F, 3)`` that is no solid any more once ``write_surface`` has rounded it.
+
+    Raises:
+        ValueError: with one sentence that begins with the file's name.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "written.ply"
+        write_surface(vertices, faces, path)
+        try:
+            back, triangles = load_surface(path)
+        except ValueError as error:
+            reason = str(error).removeprefix("mesh 'written.ply' ")
+            raise ValueError(f"mesh '{name}' in 32-bit metres {reason}") from error
+    corners = vertices[faces] - vertices.mean(axis=0)
+    volume, rounded = np.linalg.det(corners).sum(), np.linalg.det(back[triangles] - vertices.mean(axis=0)).sum()
+    if abs(rounded - volume) > 1e-3 * abs(volume):
+        raise ValueError(
+            f"mesh '{name}' must keep its volume in 32-bit metres within 0.1 %, got {rounded / volume - 1:.2%}: "
+            "its walls are too thin"
+        )
 
 
 def write_surface(vertices: NDArray[np.float64], faces: NDArray[np.int64], path: Path) -> None:

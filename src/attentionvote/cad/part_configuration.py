@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ def configuration_text(part: Part, finding: SymmetryFinding, mesh: Path, source:
             f"which leaves it {away * 1e3:.3f} mm ({away / d:.2%} of D) away or more"
         )
     symmetry = "\n".join(f"  {key}: {json.dumps(value)}" for key, value in _symmetry_settings(part).items())
-    return f"""# {part.name}: made by `make part` from {source}.
+    made = "\n# ".join(wrap(f"{part.name}: made by `make part` from {source}.", 118))
+    return f"""# {made}
 {frame}# Surface: {len(part.faces)} triangles, watertight. Lambda, the root of the surface covariance, metres, its rows:
 #   {root}
 _target_: attentionvote.simulation.load_part

@@ -15,7 +15,14 @@ from attentionvote.cad.assembly import as_one, assembly_question, listed, told_a
 from attentionvote.cad.bodies import inside
 from attentionvote.cad.healing import CannotHeal, Changes, counted, healed
 from attentionvote.cad.hole_filling import LARGEST_MOVE
-from attentionvote.cad.mesh_file import FORMATS, METRES_PER_UNIT, check_size, largest_vertex_distance, read_mesh
+from attentionvote.cad.mesh_file import (
+    FORMATS,
+    METRES_PER_UNIT,
+    check_size,
+    largest_vertex_distance,
+    load_surface,
+    read_mesh,
+)
 from attentionvote.cad.step_file import STEP_FORMATS, read_step
 from attentionvote.cad.surface_distance import SurfaceDistance
 from attentionvote.cad.touching_edges import SET_APART, set_apart
@@ -39,6 +46,7 @@ class ImportedPart(NamedTuple):
         report: what was healed, one line.
         moved: how far the surface went, metres.
         bodies: sizes of the bodies in the file, one for each.
+        source: the file, and the unit it was read in.
     """
 
     vertices: Array
@@ -46,6 +54,13 @@ class ImportedPart(NamedTuple):
     report: str
     moved: float
     bodies: list[str]
+    source: str = ""
+
+    @property
+    def line(self) -> str:
+        """Which file, what was done to it, and how far that moved the surface."""
+        moved = f"; the surface moved by {self.moved * 1e6:.2g} um at most" if self.moved else ""
+        return f"{self.source}: {self.report}{moved}"
 
 
 def import_part(
@@ -67,9 +82,23 @@ def import_part(
     path = Path(path)
     vertices, faces = _read(path, units)
     try:
-        return _imported(vertices, faces, path.name, body)
+        result = _imported(vertices, faces, path.name, body)
+        if body and len(result.bodies) > 1 and path.suffix.lower() in STEP_FORMATS:
+            # Cut anew for the size of this body: the assembly's chords may be coarse for it.
+            diameter = largest_vertex_distance(result.vertices)
+            vertices, faces = read_step(path, units, diameter)
+            result = _imported(vertices, faces, path.name, body, result.vertices)
     except CannotHeal as error:
         raise ValueError(_refusal(error, path.name, vertices, faces, picture)) from error
+    if picture is not None:
+        picture.unlink(missing_ok=True)  # of an attempt before
+    is_step = path.suffix.lower() in STEP_FORMATS
+    if result.report == NOTHING and len(result.bodies) == 1 and not is_step:
+        # What was whole already comes as the strict reader has it, so that a part made before is the same part again.
+        strict, triangles = load_surface(path, units or "m")
+        if len(triangles) == len(result.faces):
+            result = result._replace(vertices=strict, faces=triangles)
+    return result._replace(source=path.name if is_step else f"{path.name} in {units or 'm'}")
 
 
 def _corners_of(vertices: Array, faces: Ints) -> Array:
@@ -101,8 +130,11 @@ def _read(path: Path, units: str | None) -> tuple[Array, Ints]:
     return vertices, faces
 
 
-def _imported(vertices: Array, faces: Ints, name: str, body: int | None) -> ImportedPart:
-    """The part in metres; works on it in shares of its diameter, about its middle."""
+def _imported(vertices: Array, faces: Ints, name: str, body: int | None, near: Array | None = None) -> ImportedPart:
+    """The part in metres; works on it in shares of its diameter, about its middle.
+
+    Given the corners ``near`` ``(N, 3)`` of a body, that one is taken, whatever its number is by now.
+    """
     used = _corners_of(vertices, faces)
     diameter = largest_vertex_distance(used)
     centre = (used.max(axis=0) + used.min(axis=0)) / 2
@@ -117,8 +149,13 @@ def _imported(vertices: Array, faces: Ints, name: str, body: int | None) -> Impo
             raise ValueError(f"mesh '{name}' {assembly_question(split, diameter)}")
         if body and count > 1:
             # Again from the file's own triangles: what is a rounding in the whole may be a feature of this body.
+            chosen = body - 1
+            if near is not None:
+                boxes = [_box(split.vertices[split.faces[split.body == k]].reshape(-1, 3)) for k in range(count)]
+                away = [np.abs(box - (_box(near) - centre) / diameter).max() for box in boxes]
+                chosen = int(np.argmin(away))
             stand = merged((vertices - centre) / diameter)[0]
-            is_there = np.isin(np.arange(len(vertices)), whole.source[split.faces[split.body == body - 1]])
+            is_there = np.isin(np.arange(len(vertices)), whole.source[split.faces[split.body == chosen]])
             result = _imported(vertices, faces[is_there[stand[faces]].any(axis=1)], name, ALL)
             report = f"body {body} of {count}" + (f"; {result.report}" if result.report != NOTHING else "")
             return result._replace(report=report, bodies=split.sizes)
@@ -134,6 +171,11 @@ def _imported(vertices: Array, faces: Ints, name: str, body: int | None) -> Impo
         raise
     report = ", ".join(changes.notes) or NOTHING
     return ImportedPart(points * diameter + centre, triangles, report, changes.moved * diameter, split.sizes)
+
+
+def _box(points: Array) -> Array:
+    """Lowest and highest corner ``(2, 3)``."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _check_removed(vertices: Array, faces: Ints, changes: Changes) -> None:

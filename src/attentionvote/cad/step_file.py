@@ -15,6 +15,7 @@ from attentionvote.cad.mesh_file import largest_vertex_distance
 
 STEP_FORMATS = (".step", ".stp")
 CHORD = 2e-4  # of D: how far a triangle may lie from the exact surface
+MOST_TIMES_FINER = 10
 ANGLE = 0.25  # rad between neighbours: 25 to a full turn, also on fillets that are small
 _PREFIXES = {"$": "m", ".CENTI.": "cm", ".MILLI.": "mm"}
 _LENGTH = re.compile(r"#(\d+)\s*(=\s*\([^;]*LENGTH_UNIT\s*\([^;]*\)\s*;)")
@@ -23,12 +24,15 @@ _NAMED = re.compile(r"CONVERSION_BASED_UNIT\s*\(\s*'(?P<name>[^']*)'")
 _CONTEXT = re.compile(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\(([^)]*)\)", re.DOTALL)
 
 
-def read_step(path: Path, units: str | None = None) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_step(
+    path: Path, units: str | None = None, body_diameter: float | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices ``(V, 3)`` in metres and faces ``(F, 3)`` of all solids of a STEP file, placed as the assembly has them.
 
     Args:
         path: a STEP file (AP203, AP214, AP242).
         units: what the user believes; None = nothing. The file knows, and is right.
+        body_diameter: D in metres of the body that is wanted of an assembly; None = of all of it.
 
     Raises:
         ValueError: with one sentence, when it cannot be read, says another unit, or cascadio is missing.
@@ -48,6 +52,8 @@ def read_step(path: Path, units: str | None = None) -> tuple[NDArray[np.float64]
     # The first look is only for the size.
     rough = _triangles(cascadio, content, path.name, 0.2, 0.8, is_relative=True)
     diameter = largest_vertex_distance(rough.vertices)
+    if body_diameter is not None:  # the rest of the assembly is cut as finely, and thrown away
+        diameter = max(body_diameter, diameter / MOST_TIMES_FINER)
     # OpenCASCADE works in millimetres whatever the file's unit.
     mesh = _triangles(cascadio, content, path.name, CHORD * diameter * 1000, ANGLE, is_relative=False)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
