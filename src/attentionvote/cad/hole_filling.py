@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LARGEST_MOVE = 5e-4  # of the diameter: how far the surface may lie from the file's
-SMALL = 0.1  # a hole this wide is closed whatever is around it; a wider one if its lid goes on as its surroundings do
+SMALL = 0.1  # a hole this narrow is closed whatever is around it; a wider one if its lid goes on as its surroundings do
 GOES_ON = np.cos(np.radians(10.0))
 EXACT_CORNERS = 40  # the best lid is searched for up to this many corners
 
@@ -121,8 +121,7 @@ def _lid(vertices: Array, faces: Ints, loop: list[int], known: set[int]) -> tupl
     flat = middle - np.outer(height, normal)
     along = flat @ spread.Vh[:2].T
     widths = np.ptp(along, axis=0)
-    is_small = bool(widths.max() <= SMALL or widths.min() <= LARGEST_MOVE)
-    if not is_small and not _goes_on(vertices, faces, loop, normal):
+    if len(points) > 3 and widths.min() > SMALL and not _goes_on(vertices, faces, loop, normal):
         return None, off
     if len(corners) == 3:
         return corners[None], off
