@@ -173,11 +173,14 @@ def _without_leaves(vertices: Array, faces: Ints, changes: Changes) -> Ints:
 def _close(vertices: Array, faces: Ints, changes: Changes) -> tuple[Array, Ints, Ints]:
     opened = holes = 0
     off = 0.0
+    turned = 0
     for _ in range(4):
+        before = faces
         try:
             faces, mate = paired(vertices, faces)
         except ValueError as error:
             raise CannotHeal("has a surface with one side only", vertices[faces[:, :2]]) from error
+        turned += int((faces[:, 0] != before[:, 0]).sum())
         is_open = mate < 0
         if not is_open.any():
             break
@@ -204,6 +207,8 @@ def _close(vertices: Array, faces: Ints, changes: Changes) -> tuple[Array, Ints,
         off = max(off, result.uncertainty)
     else:
         raise CannotHeal("must be watertight, got edges that no lid closes", _lines(vertices, faces, mate))
+    if turned:
+        changes.note(f"turned {counted(turned, 'face', 'faces')}")
     if holes:
         changes.note(f"closed {counted(holes, 'hole', 'holes')} ({opened} open edges)", off)
     return vertices, faces, mate

@@ -18,6 +18,7 @@ from attentionvote.cad.hole_filling import LARGEST_MOVE
 from attentionvote.cad.mesh_file import (
     FORMATS,
     METRES_PER_UNIT,
+    SMALLEST_EXTENT,
     check_size,
     largest_vertex_distance,
     load_surface,
@@ -158,6 +159,9 @@ def _imported(vertices: Array, faces: Ints, name: str, body: int | None, near: A
             is_there = np.isin(np.arange(len(vertices)), whole.source[split.faces[split.body == chosen]])
             result = _imported(vertices, faces[is_there[stand[faces]].any(axis=1)], name, ALL)
             report = f"body {body} of {count}" + (f"; {result.report}" if result.report != NOTHING else "")
+            largest = float(np.ptp(result.vertices, axis=0).max())
+            if largest < SMALLEST_EXTENT:
+                raise ValueError(f"mesh '{name}' must have bodies of 1 mm or more, got {largest:.3g} m for BODY={body}")
             return result._replace(report=report, bodies=split.sizes)
         points, triangles, apart = set_apart(as_one(whole, split, changes))
         if apart:

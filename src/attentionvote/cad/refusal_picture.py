@@ -32,7 +32,7 @@ def write_refusal(triangles: NDArray[np.float64], where: NDArray[np.float64], ti
         # Short lines would not be seen on a large part.
         axes.plot(*lines.mean(axis=1).T, linestyle="none", marker="o", markersize=5, color="red", alpha=0.5)
         axes.set(**{f"{k}lim": (m - half, m + half) for k, m in zip("xyz", middle, strict=True)})
-        axes.set_title(name)
+        axes.set_title(f"{name}, mm")
         axes.set_box_aspect((1, 1, 1), zoom=1.2)
         axes.view_init(elevation, azimuth)
     figure.suptitle(title, wrap=True)
