@@ -158,6 +158,40 @@ def test_what_touches_or_overlaps_counts_once(tmp_path: Path) -> None:
     assert part.report == "kept 1 cavity"
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_cubes_that_touch_in_every_way_fill_their_volume(tmp_path: Path, turn: float) -> None:
+    # Half of 27 cells at random: contacts by faces, by edges of four and six faces, by corners, and cavities.
+    for seed in range(8):
+        cells = np.argwhere(np.random.default_rng(seed).random((3, 3, 3)) < 0.5)
+        cubes = trimesh.util.concatenate([box([10, 10, 10], at(*(10.0 * cell))) for cell in cells])
+        cubes.apply_transform(trimesh.transformations.rotation_matrix(turn, [1, 2, 3]))
+        part = import_part(written(cubes.triangles, tmp_path / "cubes.ply"), "mm", 0)
+        check_written(part.vertices, part.faces, "cubes.ply")
+        assert solid_of(part).volume == pytest.approx(len(cells) * 1e-6, rel=1e-3)
+        assert part.moved <= 2.1e-5 * np.linalg.norm(cubes.extents) / 1000
+
+
+def test_any_triangles_become_a_solid_or_one_sentence(tmp_path: Path) -> None:
+    accepted = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        corners = rng.normal(size=(rng.integers(4, 12), 3)) * 10
+        faces = rng.integers(len(corners), size=(rng.integers(4, 60), 3))
+        if seed % 2:  # nearly whole: a ball with a few faces anywhere
+            ball = icosphere(1, 10)
+            corners, faces = np.asarray(ball.vertices), np.asarray(ball.faces).copy()
+            faces[rng.integers(len(faces), size=3)] = rng.integers(len(corners), size=(3, 3))
+        trimesh.Trimesh(corners, faces, process=False).export(tmp_path / "any.ply")
+        try:
+            part = import_part(tmp_path / "any.ply", "mm", 0)
+            check_written(part.vertices, part.faces, "any.ply")
+            accepted += 1
+            assert solid_of(part).volume > 0
+        except ValueError as error:
+            assert str(error).startswith("mesh 'any.ply' "), seed  # noqa: PT017
+    assert 10 < accepted < 50
+
+
 def test_a_ball_in_a_cavity_is_a_body_of_its_own(tmp_path: Path) -> None:
     shell = icosphere(2, 12)
     shell.invert()

@@ -96,7 +96,10 @@ def healed(vertices: Array, faces: Ints, changes: Changes, length: float) -> Who
         )
     faces = _without_copies(vertices, faces, changes)
     vertices, faces = _zip_cracks(vertices, faces, changes, length)
+    whole = faces
     faces = _without_leaves(vertices, faces, changes)
+    if len(faces) < 4:
+        raise CannotHeal("encloses nothing: walls and fins are all there is", vertices[whole[:, :2]])
     vertices, faces, mate = _close(vertices, faces, changes)
     return _whole(vertices, faces, mate)
 

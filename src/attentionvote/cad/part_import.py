@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attentionvote.cad.assembly import as_one, assembly_question, listed, told_apart
-from attentionvote.cad.bodies import inside
+from attentionvote.cad.bodies import EMPTY, inside
 from attentionvote.cad.healing import CannotHeal, Changes, counted, healed
 from attentionvote.cad.hole_filling import LARGEST_MOVE
 from attentionvote.cad.mesh_file import (
@@ -166,6 +166,9 @@ def _imported(vertices: Array, faces: Ints, name: str, body: int | None, near: A
         points, triangles, apart = set_apart(as_one(whole, split, changes))
         if apart:
             changes.note(f"set {counted(apart, 'touching edge', 'touching edges')} apart", SET_APART)
+        volume = float(np.linalg.det(points[triangles]).sum()) / 6
+        if volume <= EMPTY * float(np.ptp(points, axis=0).max()) ** 3:
+            raise CannotHeal("must enclose a volume, got a sheet", points[triangles[:, :2]])
         _check_removed(points, triangles, changes)
         if changes.moved > LARGEST_MOVE:
             raise CannotHeal(f"would move by {changes.moved:.2%} of its diameter", changes.where)
