@@ -173,7 +173,7 @@ def test_cubes_that_touch_in_every_way_fill_their_volume(tmp_path: Path, turn: f
 
 def test_any_triangles_become_a_solid_or_one_sentence(tmp_path: Path) -> None:
     accepted = 0
-    for seed in range(60):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         corners = rng.normal(size=(rng.integers(4, 12), 3)) * 10
         faces = rng.integers(len(corners), size=(rng.integers(4, 60), 3))
@@ -189,7 +189,7 @@ def test_any_triangles_become_a_solid_or_one_sentence(tmp_path: Path) -> None:
             assert solid_of(part).volume > 0
         except ValueError as error:
             assert str(error).startswith("mesh 'any.ply' "), seed  # noqa: PT017
-    assert 10 < accepted < 50
+    assert 5 < accepted < 35
 
 
 def test_a_ball_in_a_cavity_is_a_body_of_its_own(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from attentionvote.cad.hole_filling import LARGEST_MOVE
 from attentionvote.cad.surface_distance import SurfaceDistance
@@ -19,6 +20,7 @@ Ints = NDArray[np.int64]
 
 EMPTY = 1e-6  # of its cubed extent: a shell with less volume encloses nothing
 PROBES = 24  # vertices of a shell that tell whether it lies inside of another
+GAP_POINTS = 200
 MOST_SHELLS = 2000
 
 
@@ -127,12 +129,12 @@ def united(vertices: Array, faces: Ints, solid: Ints) -> tuple[Array, Ints, floa
 
 
 def gap(vertices: Array, faces: Ints, other: Ints) -> float:
-    """Distance between two surfaces that do not touch, from the vertices of each: too large where edges are nearest."""
-    one, two = np.unique(faces), np.unique(other)
-    return min(
-        float(SurfaceDistance(vertices, faces)(vertices[two]).min()),
-        float(SurfaceDistance(vertices, other)(vertices[one]).min()),
-    )
+    """Distance between two surfaces that do not touch, for people: from the vertices that look nearest, of each."""
+    one, two = (vertices[np.unique(each)] for each in (faces, other))
+    near = one[np.argsort(cKDTree(two).query(one)[0])[:GAP_POINTS]]
+    far = two[np.argsort(cKDTree(one).query(two)[0])[:GAP_POINTS]]
+    to_other, to_one = SurfaceDistance(vertices, other)(near), SurfaceDistance(vertices, faces)(far)
+    return float(min(to_other.min(), to_one.min()))
 
 
 def inside(points: Array, vertices: Array, faces: Ints) -> NDArray[np.bool_]:
