@@ -16,6 +16,7 @@ ROWS ?=
 NAME ?=
 MESH ?=
 UNITS ?=
+BODY ?=
 RUN ?=
 TRIALS ?=
 TO ?=
@@ -57,7 +58,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "setup: installing the pinned dependencies into $(VENV) (once, some minutes)" >&2
 	@$(PY) -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv $(VENV) >&2
 	@$(PY) -m pip install --disable-pip-version-check --no-input --no-compile -c constraints.txt \
-		-e '.[train,cluster,team,benchmark,dev]' >&2 \
+		-e '.[train,cad,cluster,team,benchmark,dev]' >&2 \
 		|| { echo "setup: the installation failed (pip's reason is above); run the same command to try again" >&2; exit 1; }
 	@# pip would compile on one core, and all of it; what is left out or fails is compiled when it is imported.
 	@$(PY) -m compileall -qq -j 0 -x '$(UNUSED)' $(VENV)/lib >&2 || true
@@ -153,8 +154,9 @@ check-data: $(STAMP) ## Look at a dataset (IPA, Sileane or BOP layout): what it 
 write-data: $(STAMP) ## Write generated scenes as IPA or BOP data: OBJECT=gear [ARGS="format=bop split=test"]
 	@$(PY) pipelines/write_data.py $(object) $(ARGS)
 
-part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.stl [UNITS=mm]; then `make train OBJECT=bracket`
-	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) $(ARGS)
+part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.step [UNITS=mm BODY=1]; then `make train OBJECT=bracket`
+	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) \
+		$(if $(BODY),body=$(BODY)) $(ARGS)
 
 ui: $(STAMP) ## Open the tracked runs in a browser (MLflow)
 	@$(PY) pipelines/ui.py $(ARGS)

@@ -1,6 +1,6 @@
 """Add your own part: checks the mesh, finds diameter, frame and symmetry, writes conf/object/NAME.yaml.
 
-make part NAME=widget MESH=widget.stl [UNITS=mm]; then: make train OBJECT=widget
+make part NAME=widget MESH=widget.step [UNITS=mm BODY=1]; then: make train OBJECT=widget
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     if config.exists() and not cfg.force:
         raise ConfigurationError(f"object {name!r} exists already ({config}), add force=true to replace it")
 
-    from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface, write_surface
+    from attentionvote.cad.mesh_file import check_written, largest_vertex_distance, write_surface
+    from attentionvote.cad.part_import import import_part
     from attentionvote.cad.part_picture import write_picture
     from attentionvote.cad.part_report import examine
     from attentionvote.cad.symmetry_detection import describe
@@ -39,13 +40,16 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     from attentionvote.part import Part
 
     with configuring():
-        vertices, faces = load_surface(cfg.mesh, cfg.units)
+        imported = import_part(cfg.mesh, cfg.units, cfg.body, Path(cfg.parts) / f"{name}-refused.png")
+        log.info("%s", imported.line)
+        vertices, faces = imported.vertices, imported.faces
         diameter = largest_vertex_distance(vertices)
         size = " x ".join(f"{e * 1000:.1f}" for e in vertices.max(0) - vertices.min(0))
         log.info("%s: %d triangles, %s mm, D %.2f mm; looking for symmetries", name, len(faces), size, diameter * 1e3)
         report = examine(vertices, faces, cfg.tolerance)
-    finding = report.finding
-    vertices = pose.apply(finding.part_from_file, vertices)
+        finding = report.finding
+        vertices = pose.apply(finding.part_from_file, vertices)
+        check_written(vertices, faces, Path(cfg.mesh).name)
     title = cfg.title or name.replace("_", " ").capitalize()
     part = Part(name, vertices, faces, round(diameter, 9), finding.symmetry, str(title))
     log.info("symmetry %s, residual %.3f mm", describe(finding.symmetry), finding.residual * 1e3)
@@ -61,8 +65,7 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     mesh, picture = Path(cfg.parts) / f"{name}.ply", Path(cfg.parts) / f"{name}.png"
     whole(mesh, lambda path: write_surface(part.vertices, part.faces, path))
     whole(picture, lambda path: write_picture(part, path))
-    text = configuration_text(part, report, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
-    write_whole(config, text)
+    write_whole(config, configuration_text(part, report, mesh, imported.line))
     log.info("look at %s, then: make train OBJECT=%s", picture, name)
     return {
         "stage": "part",
@@ -71,6 +74,8 @@ def run(cfg: PartSettings) -> dict[str, Any]:
         "mesh": str(mesh),
         "picture": str(picture),
         "triangles": len(part.faces),
+        "healed": imported.report,
+        "surface_moved": imported.moved,
         "diameter": part.diameter,
         "covariance_root": part.covariance_root.round(9),
         "symmetry": symmetry_settings(part),

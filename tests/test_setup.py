@@ -100,7 +100,7 @@ def test_setup_happens_once_and_again_when_the_pins_change(checkout: Path) -> No
     program(checkout / ".venv" / "bin", "python", 'echo "ran $*" >&2')
     first, second = (make(checkout, "setup", f"PYTHON={python}", first_on_path=checkout / "bin") for _ in range(2))
     assert "ran -m pip install" in first.stderr
-    assert "-c constraints.txt -e .[train,cluster,team,benchmark,dev]" in first.stderr
+    assert "-c constraints.txt -e .[train,cad,cluster,team,benchmark,dev]" in first.stderr
     assert "ran" not in second.stderr
     later = (checkout / ".venv" / ".setup-complete").stat().st_mtime + 10
     os.utime(checkout / "constraints.txt", (later, later))
@@ -117,5 +117,7 @@ def test_words_reach_the_verb(checkout: Path) -> None:
     assert done.stdout.rstrip().endswith("attentionvote serve outputs/export/gear/latest --port 80")
     done = make(checkout, "serve")
     assert "OBJECT must be given, e.g. make serve OBJECT=connecting_rod" in done.stderr
-    done = make(checkout, "--dry-run", "part", "NAME=bracket", "MESH=my meshes/b.stl", "UNITS=mm")
-    assert done.stdout.rstrip().endswith("""pipelines/part.py name=bracket "mesh='my meshes/b.stl'" units=mm""")
+    done = make(checkout, "--dry-run", "part", "NAME=bracket", "MESH=my meshes/b.stl", "UNITS=mm", "BODY=2")
+    assert " ".join(done.stdout.replace("\\", " ").split()).endswith(
+        """pipelines/part.py name=bracket "mesh='my meshes/b.stl'" units=mm body=2"""
+    )

@@ -10,9 +10,10 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from attentionvote.cad.mesh_file import FORMATS, largest_vertex_distance, load_surface, write_surface
+from attentionvote.cad.mesh_file import FEW_CORNERS, FORMATS, largest_vertex_distance, load_surface, write_surface
 
 
 def wedge() -> trimesh.Trimesh:
@@ -122,6 +123,37 @@ def test_rubbish_missing_files_and_unknown_words_are_refused(tmp_path: Path) -> 
         load_surface(tmp_path / "nowhere.stl", "feet")
 
 
+def test_a_sliver_is_left_out_only_where_that_opens_nothing(tmp_path: Path) -> None:
+    # An edge with a vertex on one side only, and a needle of no height between: the box is closed by the needle alone.
+    cube = trimesh.creation.box([10, 10, 10])
+    corners = np.vstack([cube.vertices, cube.vertices[cube.faces[0, :2]].mean(axis=0)])
+    a, b, c = cube.faces[0]
+    faces = np.vstack([cube.faces[1:], [[a, 8, c], [8, b, c], [a, b, 8]]])
+    needle = trimesh.Trimesh(corners, faces, process=False)
+    vertices, read = load_surface(written(needle, tmp_path / "needle.ply"), "mm")
+    assert len(read) == 14
+    assert trimesh.Trimesh(vertices, read, process=False).volume == pytest.approx(1e-6)
+    # Twice the same sliver, back to back, is thin as well, and goes as it always did.
+    loose = trimesh.Trimesh(corners, np.vstack([cube.faces, [[a, b, 8], [a, 8, b]]]), process=False)
+    assert len(load_surface(written(loose, tmp_path / "loose.ply"), "mm")[1]) == 12
+
+
+@pytest.mark.parametrize(
+    ("scale", "units", "message"),
+    [
+        (1.0, "m", r"got 60 m; a GLB is in metres by definition: export it again in its true size"),
+        (0.001, "mm", r"got 6e-05 m with units=mm; a GLB is in metres by definition: leave units out \(0.06 m\)"),
+        (1e-6, "inch", r"with units=inch; a GLB is in metres by definition: export it again in its true size"),
+    ],
+)
+def test_the_advice_for_a_glb_names_no_other_unit(tmp_path: Path, scale: float, units: str, message: str) -> None:
+    mesh = wedge()
+    mesh.apply_scale(scale)
+    with pytest.raises(ValueError, match=message) as error:
+        load_surface(written(mesh, tmp_path / "wedge.glb"), units)
+    assert "try units" not in str(error.value)
+
+
 def test_write_surface_is_read_back(tmp_path: Path) -> None:
     mesh = wedge()
     write_surface(mesh.vertices / 1000, mesh.faces, tmp_path / "wedge.ply")
@@ -135,6 +167,22 @@ def test_largest_vertex_distance_is_the_largest_of_all_pairs(seed: int, count: i
     points = np.random.default_rng(seed).normal(size=(count, 3))
     points[:, dimensions:] = 0.5  # flat and straight clouds have no hull
     assert largest_vertex_distance(points) == pytest.approx(pdist(points).max(), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.uv_sphere(3.0, count=[60, 60]),  # each corner is as far from the one across
+        trimesh.creation.torus(20, 5, major_sections=150, minor_sections=48),
+        trimesh.creation.capsule(5, 3, [70, 70]).apply_translation([100, 7, 3]),
+    ],
+    ids=["ball", "ring", "capsule"],
+)
+def test_thousands_of_corners_give_the_same_digits_as_each_with_each(mesh: trimesh.Trimesh) -> None:
+    corners = mesh.vertices[ConvexHull(mesh.vertices).vertices]
+    assert len(corners) > FEW_CORNERS
+    each = max(float(np.linalg.norm(corners - corner, axis=1).max()) for corner in corners)
+    assert largest_vertex_distance(np.asarray(mesh.vertices)) == each  # D is part of digests: not approximately
 
 
 def test_the_measured_sizes_of_the_check_meshes(shared_data: Callable[[str], Path]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ def configuration_text(part: Part, report: PartReport, mesh: Path, source: str) 
         )
     hidden = "".join(f"# {line}\n" for line in report.hidden_lines)
     symmetry = "\n".join(f"  {key}: {json.dumps(value)}" for key, value in symmetry_settings(part).items())
-    return f"""# {part.name}: made by `make part` from {source}.
+    made = "\n# ".join(wrap(f"{part.name}: made by `make part` from {source}.", 118))
+    return f"""# {made}
 {frame}# Surface: {len(part.faces)} triangles, watertight. Lambda, the root of the surface covariance, metres, its rows:
 #   {root}
 _target_: attentionvote.simulation.load_part

@@ -155,8 +155,15 @@ class PartSettings(VerbSettings):
 
     verb: ClassVar[str] = "part"
     name: Annotated[str, Setting("Small letters, digits and underscores, a letter first.")]
-    mesh: Annotated[str, Setting("The mesh file: STL, OBJ, PLY or GLB, one closed surface.")]
-    units: Annotated[str, Setting("Of the file's numbers.", choices=("m", "cm", "mm", "inch"))]
+    mesh: Annotated[str, Setting("The file: STEP, STL, OBJ, PLY or GLB.")]
+    units: Annotated[
+        str | None,
+        Setting("Of the file's numbers; null = what the file says, else m.", choices=("m", "cm", "mm", "inch")),
+    ]
+    body: Annotated[
+        int | None,
+        Setting("Of an assembly, the largest is 1; 0 = all as one part; null = it has one.", low=0, high=10_000),
+    ]
     title: Annotated[str, Setting("One line for people; empty: made from the name.")]
     tolerance: Annotated[
         float, Setting("How far a turned surface may be from itself for a symmetry, a share of D.", above=0, high=0.05)
