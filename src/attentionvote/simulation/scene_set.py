@@ -166,6 +166,8 @@ def content_digest(directory: Path, cycles: int) -> str:
                 h.update(np.round(values * scale).astype("<i8").tobytes())
             if r.part_ids.any():
                 h.update(r.part_ids.astype("<i4").tobytes())
+            if r.walls is not None:
+                h.update(f"{r.walls}".encode())
     return h.hexdigest()
 
 
