@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part, PartSet
 from attentionvote.setting import Identity, Setting
+from attentionvote.simulation.cell import CellSettings
 
 BUILTIN = "builtin:"
 
@@ -28,6 +29,11 @@ def load_part(
     title: Annotated[str, Setting("One line for people.", identity=Identity.ONCE)] = "",
     base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
     voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
+    # Its values stand in the settings that identify a result (command/cells.py).
+    cell: Annotated[  # noqa: ARG001
+        CellSettings | None,
+        Setting("Sensor, distance and bin; null = the benchmark's, scaled with D.", identity=Identity.NEVER),
+    ] = None,
 ) -> Part:
     """The part that ``conf/object/NAME.yaml`` describes.
 
@@ -40,6 +46,7 @@ def load_part(
         title: one line for people.
         base_radius: override of a scale setting in metres; conf/model takes it from here, not used by the part.
         voxel_size: the same for the voxel size.
+        cell: sensor, distance and bin; the settings of a verb take it from here, not used by the part.
 
     Raises:
         ValueError: with one sentence, on an unknown built-in, a broken mesh or an impossible symmetry.

@@ -12,7 +12,7 @@ from attentionvote.registry.gates import Rules
 from attentionvote.section import Target
 from attentionvote.setting import Setting
 from attentionvote.simulation.scene_spec import SimulationSettings
-from attentionvote.simulation.sensor import PRESETS
+from attentionvote.simulation.sensor import PRESETS, Sensor
 from attentionvote.workflows.evaluate.settings import MeasuredBundle
 
 SPLITS = ("train", "val", "test")
@@ -123,6 +123,20 @@ class ViewSettings(VerbSettings):
     max_points: Annotated[int, Setting("Most points of the cloud.", low=3, high=10_000_000)]
     root: Annotated[str, SCENE_SETS]
     output: Annotated[str, Setting("Where the pictures go.")]
+    scanner: Annotated[
+        Sensor | None, Setting("Figures of the preset that is shown, as the object's cell has them; null = its own.")
+    ] = None
+
+    @property
+    def shown_sensor(self) -> Sensor:
+        """The preset with the figures of the object's cell where that has the same one.
+
+        Raises:
+            ValueError: when the figures do not fit together.
+        """
+        if self.scanner is not None and self.scanner.preset == self.sensor:
+            return self.scanner
+        return Sensor(self.sensor, sigma_mm=self.sigma_mm)
 
 
 @dataclass(frozen=True, kw_only=True)
