@@ -16,6 +16,10 @@ ROWS ?=
 NAME ?=
 MESH ?=
 UNITS ?=
+SENSOR ?=
+BIN ?=
+DISTANCE ?=
+CAMERA ?=
 RUN ?=
 TRIALS ?=
 TO ?=
@@ -29,6 +33,8 @@ ifneq ($(CONF),)
 export ATTENTIONVOTE_CONF := $(abspath $(CONF))
 endif
 object := $(if $(OBJECT),object=$(OBJECT))
+# Of a new part's cell.
+cell = $(if $(SENSOR),sensor=$(SENSOR)) $(if $(BIN),"bin='$(BIN)'") $(if $(DISTANCE),distance=$(DISTANCE)) $(if $(CAMERA),"camera='$(CAMERA)'")
 # Of one training, each with a GPU of its own (docs/several-processes.md).
 PROCESSES ?=
 several := $(if $(PROCESSES),pipelines/start_processes.py --standalone --nproc-per-node=$(PROCESSES))
@@ -150,8 +156,8 @@ check-data: $(STAMP) ## Look at a dataset (IPA, Sileane or BOP layout): what it 
 write-data: $(STAMP) ## Write generated scenes as IPA or BOP data: OBJECT=gear [ARGS="format=bop split=test"]
 	@$(PY) pipelines/write_data.py $(object) $(ARGS)
 
-part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.stl [UNITS=mm]; then `make train OBJECT=bracket`
-	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) $(ARGS)
+part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.stl [UNITS=mm SENSOR=phoxi_m BIN=360x280x160 DISTANCE=800]; then `make train OBJECT=bracket`
+	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) $(cell) $(ARGS)
 
 ui: $(STAMP) ## Open the tracked runs in a browser (MLflow)
 	@$(PY) pipelines/ui.py $(ARGS)

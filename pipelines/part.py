@@ -1,6 +1,6 @@
 """Add your own part: checks the mesh, finds diameter, frame and symmetry, writes conf/object/NAME.yaml.
 
-make part NAME=widget MESH=widget.stl [UNITS=mm]; then: make train OBJECT=widget
+make part NAME=widget MESH=widget.stl [UNITS=mm SENSOR=phoxi_m BIN=360x280x160 DISTANCE=800]; then: make train ...
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from attentionvote.command.conf_folder import new_file
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import whole, write_whole
+from attentionvote.workflows.part_cell import cell_facts, cell_of
 from attentionvote.workflows.settings import PartSettings
 
 log = logging.getLogger("attentionvote.part")
@@ -36,12 +37,14 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     from attentionvote.cad.symmetry_detection import describe, detect_symmetry
     from attentionvote.geometry import pose
     from attentionvote.part import Part
+    from attentionvote.simulation.cell_text import cell_text
 
     with configuring():
         vertices, faces = load_surface(cfg.mesh, cfg.units)
         diameter = largest_vertex_distance(vertices)
         size = " x ".join(f"{e * 1000:.1f}" for e in vertices.max(0) - vertices.min(0))
         log.info("%s: %d triangles, %s mm, D %.2f mm; looking for symmetries", name, len(faces), size, diameter * 1e3)
+        cell = cell_of(cfg, vertices, faces, diameter)
         finding = detect_symmetry(vertices, faces, cfg.tolerance)
     vertices = pose.apply(finding.part_from_file, vertices)
     title = cfg.title or name.replace("_", " ").capitalize()
@@ -54,7 +57,7 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     whole(mesh, lambda path: write_surface(part.vertices, part.faces, path))
     whole(picture, lambda path: write_picture(part, path))
     text = configuration_text(part, finding, mesh, f"{Path(cfg.mesh).name} in {cfg.units}")
-    write_whole(config, text)
+    write_whole(config, text + cell_text(cell))
     log.info("look at %s, then: make train OBJECT=%s", picture, name)
     return {
         "stage": "part",
@@ -65,6 +68,7 @@ def run(cfg: PartSettings) -> dict[str, Any]:
         "triangles": len(part.faces),
         "diameter": part.diameter,
         "covariance_root": part.covariance_root.round(9),
+        "cell": cell_facts(cell),
         "symmetry": _symmetry_settings(part),
         "symmetry_residual": finding.residual,
         "symmetry_tolerance": finding.tolerance,

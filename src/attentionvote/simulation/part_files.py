@@ -82,6 +82,9 @@ def load_parts(
     title: Annotated[str, Setting("One line for people.", identity=Identity.ONCE)] = "",
     base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
     voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
+    cell: Annotated[  # noqa: ARG001
+        CellSettings | None, Setting("As of a part; null = the parts' own.", identity=Identity.NEVER)
+    ] = None,
 ) -> PartSet:
     """The set of parts in one bin that ``conf/object/NAME.yaml`` describes.
 
@@ -91,6 +94,7 @@ def load_parts(
             already, in the order of the network's classes; at least two.
         title: one line for people.
         base_radius, voxel_size: as in ``load_part``; left out, derived from D of the largest part.
+        cell: as in ``load_part``; left out, that of the parts.
 
     Raises:
         ValueError: with one sentence, on too few parts, settings that describe none, or two that cannot be told apart.

@@ -13,6 +13,7 @@ from attentionvote.section import Target
 from attentionvote.setting import Setting
 from attentionvote.simulation.scene_spec import SimulationSettings
 from attentionvote.simulation.sensor import PRESETS, Sensor
+from attentionvote.simulation.sensor_models import CUSTOM, SENSOR_MODELS
 from attentionvote.workflows.evaluate.settings import MeasuredBundle
 
 SPLITS = ("train", "val", "test")
@@ -174,6 +175,18 @@ class PartSettings(VerbSettings):
     title: Annotated[str, Setting("One line for people; empty: made from the name.")]
     tolerance: Annotated[
         float, Setting("How far a turned surface may be from itself for a symmetry, a share of D.", above=0, high=0.05)
+    ]
+    sensor: Annotated[
+        str | None,
+        Setting("Of the cell: a model, or custom; null = by the bin's size.", choices=(*SENSOR_MODELS, CUSTOM)),
+    ]
+    bin: Annotated[str | None, Setting("Inner length x width x height in mm; null = a usual one for the part's size.")]
+    distance: Annotated[
+        float | None,
+        Setting("From the camera to the bin, mm; null = so that the bin fills the picture.", low=50, high=100_000),
+    ]
+    camera: Annotated[
+        str | None, Setting("Of a custom sensor: a file with fx.., cam_K, K or ROS's CameraInfo; null = none.")
     ]
     force: Annotated[bool, Setting("Replace an object of the same name.")]
     parts: Annotated[str, Setting("Where the mesh in the part frame and its picture go.")]
