@@ -160,11 +160,12 @@ def _check_room(parts: Parts, size: Size) -> None:
 
 
 def _smallest_sensor(size: Size, walls: Walls, wanted: float | None) -> str:
-    """The first of the scanners whose picture holds the bin within its range, at the wanted distance."""
+    """The first of the scanners that measures all of the bin, within its range and picture, at the wanted distance."""
     for name in ("phoxi_s", "phoxi_m", "phoxi_l"):
         model = SENSOR_MODELS[name]
         least = fitting_distance(model.camera, size, walls)
-        if least <= model.far and (wanted is None or max(least, model.near) <= wanted <= model.far):
+        nearest, farthest = _whole_bin(size, model.near, model.far, 0.0 if wanted else CellSettings.distance_jitter)
+        if max(least, nearest) <= (wanted or farthest) <= farthest:
             return name
     given = "x".join(f"{side * 1000:g}" for side in size)
     at = "" if wanted is None else f" at distance={wanted * 1000:g}"
@@ -184,8 +185,7 @@ def _distance(name: str, size: Size, wanted: float | None, least: float, reach: 
         )
     if wanted is None:
         # All of the bin in the sensor's range, from scene to scene, where its picture allows that.
-        jitter = CellSettings.distance_jitter
-        nearest, farthest = (near + size[2] * 2 / 3) / (1 - jitter), (far - size[2] / 3) / (1 + jitter)
+        nearest, farthest = _whole_bin(size, near, far, CellSettings.distance_jitter)
         return round(float(np.ceil(max(least, min(nearest, farthest)) / _STEP - 1e-9)) * _STEP, 4)
     if not near <= wanted <= far:
         raise ValueError(
@@ -198,6 +198,11 @@ def _distance(name: str, size: Size, wanted: float | None, least: float, reach: 
             f"bin of {given} mm; got {wanted * 1000:g}"
         )
     return round(wanted, 6)
+
+
+def _whole_bin(size: Size, near: float, far: float, jitter: float) -> tuple[float, float]:
+    """Distances to a point a third up the bin between which all of it lies in a sensor's range, whatever the jitter."""
+    return (near + size[2] * 2 / 3) / (1 - jitter), (far - size[2] / 3) / (1 + jitter)
 
 
 def _others(size: Size, name: str) -> str:

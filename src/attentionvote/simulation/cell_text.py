@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 from attentionvote.simulation.cell import CellSettings
@@ -13,10 +14,10 @@ def cell_text(cell: CellSettings) -> str:
     camera, walls, measures = cell.camera, cell.bin.walls, cell.measures
     model = SENSOR_MODELS.get(cell.sensor)
     if model is None:
-        source, reach = "a camera of yours, from its file", ""
+        source, reach = "  # A camera of yours, from its file.", ""
     else:
-        source = f"{model.title}: {model.sheet}"
-        reach = f" The sensor measures from {model.near:g} to {model.far:g} m."
+        source = textwrap.fill(f"{model.title}: {model.sheet}.", 118, initial_indent="  # ", subsequent_indent="  # ")
+        reach = f"\n  # The sensor measures from {model.near:g} to {model.far:g} m."
     noise = "  measures: null\n"
     if measures is not None:
         noise = f"""  measures:
@@ -33,7 +34,7 @@ def cell_text(cell: CellSettings) -> str:
     return f"""# What training, evaluation, gates and view are simulated with; a word on the command line wins, e.g.
 # simulation.camera.distance=0.9. null = the benchmark's protocol, whose lengths scale with D.
 cell:
-  # {source}
+{source}
   sensor: {cell.sensor}
   # From the camera to a point a third up the bin's axis, metres; varies by the share below.{reach}
   distance: {cell.distance!r}
