@@ -71,7 +71,8 @@ def _values(cell: CellSettings) -> Iterator[tuple[str, Any]]:
     """Dotted settings of any verb with what the cell says."""
     yield "simulation.bin.size", list(cell.bin.size)
     yield "simulation.bin.jitter", cell.bin.jitter
-    yield "simulation.bin.walls", asdict(cell.bin.walls)
+    for name, value in asdict(cell.bin.walls).items():
+        yield f"simulation.bin.walls.{name}", value
     for name, value in asdict(cell.camera).items():
         yield f"simulation.camera.camera.{name}", value
     yield "simulation.camera.distance", cell.distance
@@ -93,8 +94,8 @@ def _values(cell: CellSettings) -> Iterator[tuple[str, Any]]:
 
 
 def _is_chosen(key: str, plain: Any, defaults: Any, keys: Collection[str]) -> bool:
-    """Whether the user chose a setting: by a word for it, for what it lies in or for something in it, or by a group."""
-    if any(key == word or key.startswith(f"{word}.") or word.startswith(f"{key}.") for word in keys):
+    """Whether the user chose a setting: by a word for it or for what it lies in, or by a group."""
+    if any(key == word or key.startswith(f"{word}.") for word in keys):
         return True
     for name in key.split("."):
         plain, defaults = ((at.get(name) if isinstance(at, Mapping) else None) for at in (plain, defaults))

@@ -37,9 +37,14 @@ BINS: tuple[tuple[str, tuple[int, int, int], Walls], ...] = (
     ("Euro container 800 x 600", (750, 550, 320), _LARGE),
     ("pallet box 1200 x 800", (1160, 760, 500), _PALLET),
 )
+
 _ROOM = 0.9  # of the protocol's floor and height, below which a bin is too small for the part's piles
 _LEAST_PARTS = 6  # the smallest pile of conf/simulation
 _STEP = 0.005  # distances are multiples of it, metres
+
+
+class NoUsualCell(ValueError):
+    """A part is too large for the bins and scanners that are usual."""
 
 
 def parsed_bin(text: str) -> Size:
@@ -69,14 +74,14 @@ def default_bin(parts: Parts, count: int) -> Size:
     """The smallest usual bin with nine tenths of the room that the benchmark's protocol gives ``count`` parts.
 
     Raises:
-        ValueError: when there is none so large.
+        NoUsualCell: when there is none so large.
     """
     needed = _ROOM * _protocol_bin(parts, count)
     for _, size, _ in BINS:
         if (np.array(size) / 1000 >= needed).all():
             return tuple(side / 1000 for side in size)  # type: ignore[return-value]  # three
     length, width, height = needed * 1000 / _ROOM
-    raise ValueError(
+    raise NoUsualCell(
         f"bin must be given for a part of {parts.diameter * 1000:.0f} mm, of which {count} fit no usual bin, e.g. "
         f"bin={length:.0f}x{width:.0f}x{height:.0f}"
     )

@@ -9,8 +9,10 @@ from attentionvote.simulation.cell import CellSettings
 from attentionvote.simulation.sensor_models import SENSOR_MODELS
 
 
-def cell_text(cell: CellSettings) -> str:
+def cell_text(cell: CellSettings | None) -> str:
     """The lines of the section, metres but for the noise."""
+    if cell is None:
+        return "# Sensor, distance and bin of a cell; null = the benchmark's, scaled with D.\ncell: null\n"
     camera, walls, measures = cell.camera, cell.bin.walls, cell.measures
     model = SENSOR_MODELS.get(cell.sensor)
     if model is None:

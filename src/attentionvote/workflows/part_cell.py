@@ -17,22 +17,29 @@ log = logging.getLogger("attentionvote.part")
 _DENSITY = 40_000  # of conf/data
 
 
-def cell_of(cfg: PartSettings, vertices: NDArray, faces: NDArray, diameter: float) -> CellSettings:
-    """The cell that the settings mean for a surface of that diameter, and what its sensor can tell of the part.
+def cell_of(cfg: PartSettings, vertices: NDArray, faces: NDArray, diameter: float) -> CellSettings | None:
+    """The cell that the settings mean for a surface of that diameter; says what its sensor can tell. None for a part
+    that is larger than usual cells are made for, and of whose cell nothing is said.
 
     Raises:
         ValueError: with one sentence, when sensor, bin and distance do not fit together.
         FileNotFoundError: when there is no camera file.
     """
     from attentionvote.part import Part
-    from attentionvote.simulation.cell_choice import choose_cell
+    from attentionvote.simulation.cell_choice import NoUsualCell, choose_cell
     from attentionvote.simulation.resolution import resolution
     from attentionvote.simulation.scene_spec import SceneSetSpec
     from attentionvote.simulation.sensor import Sensor
 
     part, count = Part(cfg.name, vertices, faces, diameter), SceneSetSpec.drop_counts[-1]
     camera = None if cfg.camera is None else Path(cfg.camera)
-    cell = choose_cell(part, count, cfg.sensor, cfg.bin, cfg.distance, camera)
+    try:
+        cell = choose_cell(part, count, cfg.sensor, cfg.bin, cfg.distance, camera)
+    except NoUsualCell as error:
+        if cfg.sensor or cfg.distance or camera:
+            raise
+        log.warning("the part gets no cell, its scenes scale with D as the benchmark's: %s", error)
+        return None
     log.info("cell: %s at %g mm, bin %s mm", cell.sensor, cell.distance * 1000, _mm(cell.bin.size))
     if cell.area is not None:
         log.info("parts are dropped over %s mm of the bin's floor: a heap of %d", _mm(cell.area), count)
@@ -44,8 +51,10 @@ def cell_of(cfg: PartSettings, vertices: NDArray, faces: NDArray, diameter: floa
     return cell
 
 
-def cell_facts(cell: CellSettings) -> dict[str, Any]:
+def cell_facts(cell: CellSettings | None) -> dict[str, Any] | None:
     """The cell for the JSON line, metres."""
+    if cell is None:
+        return None
     return {
         "sensor": cell.sensor,
         "distance": cell.distance,
