@@ -67,8 +67,8 @@ class EvaluationJob:
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether a word places the camera or changes the bin: such figures tell what a model bears, beside its own."""
-        return any(word.lstrip("+").startswith(("simulation.camera.", "simulation.bin.")) for word in self.cfg.words)
+        """Whether a word places the camera elsewhere: such figures tell what a model bears, beside the run's own."""
+        return any(word.lstrip("+").startswith("simulation.camera.distance") for word in self.cfg.words)
 
     def evaluation_set(self) -> MeasuredScenes:
         """The scenes to measure on, see ``scenes_of``.
