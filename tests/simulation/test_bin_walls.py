@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from attentionvote.geometry.pose import apply, rotation_about, transform
 from attentionvote.part import Part
-from attentionvote.simulation.bin_walls import Walls, bin_mesh, bin_outlines, wall_planes
+from attentionvote.simulation import drop
+from attentionvote.simulation.bin_walls import Walls, bin_mesh, bin_outlines, wall_pieces, wall_planes
 from attentionvote.simulation.decomposition import Hulls
 from attentionvote.simulation.drop import Solid, drop_parts
 from attentionvote.simulation.drop_settings import BinSettings, DropSettings
+from attentionvote.simulation.mass import mass_properties
 from attentionvote.simulation.raycast import BinSurface, PartCaster
 
 SIZE = np.array([0.30, 0.20, 0.10])
@@ -60,6 +64,34 @@ def test_what_the_physics_lets_in_is_what_the_surface_leaves_free(walls: Walls, 
         elif inside:
             assert floor < point[2]  # the leaning wall comes first
     assert surface.walls is walls
+
+
+@given(shapes, st.integers(0, 1000))
+def test_the_walls_pieces_leave_the_inside_free_and_no_gap(walls: Walls, seed: int) -> None:
+    pieces = [ConvexHull(piece).equations for piece in wall_pieces(SIZE, walls)]
+    outer = walls.outer_size(SIZE) / 2
+    at = np.random.default_rng(seed).uniform([*-outer, 0.0], [*outer, 0.12], (300, 3))
+    in_a_piece = np.array([(at @ e[:, :3].T + e[:, 3] <= 0).all(axis=1) for e in pieces]).any(axis=0)
+    points, normals = wall_planes(SIZE, walls)
+    free = np.einsum("pki,ki->pk", at[:, None] - points, normals).min(axis=1)
+    clear = (np.abs(free) > 1e-9) & (np.abs(at[:, 2] - SIZE[2]) > 1e-9)
+    np.testing.assert_array_equal(in_a_piece[clear], ((free < 0) & (at[:, 2] < SIZE[2]))[clear])
+
+
+def test_a_long_part_lies_on_the_rim() -> None:
+    """Longer than the shallow bin, on its two short walls: it neither sinks through nor falls beside them."""
+    bar = trimesh.creation.box([0.325, 0.01, 0.01])
+    part = Part("bar", np.array(bar.vertices), np.array(bar.faces), 0.325)
+    shallow, walls = np.array([0.30, 0.20, 0.03]), Walls(rim=0.02)
+    model = drop._build_model(
+        [Solid(part, (part.vertices,))], [mass_properties(part)], np.zeros(1, np.int32), shallow, 0.4, DropSettings(),
+        walls,
+    )  # fmt: skip
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0, 0, 0.05, 1, 0, 0, 0]
+    model.body_gravcomp[1] = 0.0
+    mujoco.mj_step(model, data, nstep=300)
+    assert data.qpos[2] == pytest.approx(0.03 + 0.005, abs=0.001)  # half of its height above the rim
 
 
 def test_corners_are_round_within_two_hundredths() -> None:

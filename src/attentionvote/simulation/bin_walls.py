@@ -2,7 +2,8 @@
 
 Bin frame: origin in the middle of the floor, z up. The inside is cut out by the floor and by inward half-spaces, one a
 side and three a rounded corner, whose outline on the floor goes round the corner's arc; every half-space leans outward
-by the draft. The mesh that rays meet has exactly these sides, so no part rests in a wall that a ray sees elsewhere.
+by the draft. The mesh that rays meet and the pieces that parts touch have exactly these sides, so no part rests in a
+wall that a ray sees elsewhere.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from attentionvote.setting import Setting
 Floats = NDArray[np.float64]
 # Angles, in shares of a quarter turn, of the half-spaces of a corner: the arc is met within 2 % of its radius.
 _CORNER = (0.25, 0.5, 0.75)
+_SOLID = 0.05  # metres
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,26 @@ def bin_outlines(size: Floats, walls: Walls) -> list[Floats]:
     # The underside: where the outer wall goes on down to.
     rings.append((thickness - min(walls.lean(thickness), thickness / 2), -thickness))
     return [_outline(size, walls, out, z) for out, z in rings]
+
+
+def wall_pieces(size: Floats, walls: Walls) -> list[Floats]:
+    """Corners ``(8, 3)`` of convex pieces that are the walls, one a side and half-space of a corner, up to the rim.
+
+    Below the rim they are solid, and they go on beyond it outside: nothing comes there, nor tunnels through.
+    """
+    height, width = float(size[2]), walls.thickness + walls.rim + _SOLID
+    rings = [
+        _outline(size, walls, out, z)
+        for out, z in (
+            (0.0, 0.0),
+            (walls.lean(height), height),
+            (walls.lean(height) + width, height),
+            (walls.lean(height) + width, 0.0),
+        )
+    ]
+    count = len(rings[0])
+    # The line of side i lies between the corners i - 1 and i.
+    return [np.concatenate([ring[[i - 1, i]] for ring in rings]) for i in range(count)]
 
 
 def bin_mesh(size: Floats, walls: Walls) -> tuple[Floats, NDArray[np.int64]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part
-from attentionvote.simulation.bin_walls import Walls, wall_planes
+from attentionvote.simulation.bin_walls import Walls, wall_pieces
 from attentionvote.simulation.decomposition import Hulls
 from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.mass import Mass, mass_properties
@@ -43,8 +43,8 @@ def drop_parts(
 ) -> Iterator[NDArray[np.float64]]:
     """Drop parts in sequence and yield every pile that came to rest.
 
-    The bin's walls go on invisibly above the rim, as infinite planes: nothing falls out or tunnels through, and
-    the rim, which lies outside of them, holds nothing.
+    The bin's walls go on invisibly above the rim, as infinite planes: nothing falls out or tunnels through. Walls with
+    a shape end at the rim, on which parts can lie; the planes stand where the rim ends outside.
     A pile that still moves (> 5 cm/s) after the timeout is left out. The cycle ends early when a part rests above the
     rim (the bin is full), left the bin, or any value is not finite.
 
@@ -146,15 +146,11 @@ def _settle(model: mujoco.MjModel, data: mujoco.MjData, dropped: int, settings: 
 
 
 def _planes(bin_size: NDArray[np.float64], walls: Walls | None) -> list[tuple[list[float], list[float]]]:
-    """Floor and walls: a point of each, and the quaternion that turns z to its inward normal."""
+    """Floor and upright planes that end what a part can reach, the walls where they have no shape: a point of each, and
+    the quaternion that turns z to its inward normal."""
     floor: tuple[list[float], list[float]] = ([0, 0, 0], [1, 0, 0, 0])
-    if walls is not None:
-        points, normals = wall_planes(bin_size, walls)
-        # The half turn about the middle between z and the normal takes one to the other.
-        half_way = normals + np.array([0.0, 0.0, 1.0])
-        half_way /= np.linalg.norm(half_way, axis=1, keepdims=True)
-        quaternions = np.concatenate([np.zeros((len(points), 1)), half_way], axis=1)
-        return [floor, *((point.tolist(), turn.tolist()) for point, turn in zip(points, quaternions, strict=True))]
+    if walls is not None:  # where the rim ends, upright
+        bin_size = np.array([*walls.outer_size(bin_size), bin_size[2]])
     x, y, root = bin_size[0] / 2, bin_size[1] / 2, np.sqrt(0.5)
     return [
         floor,
@@ -197,6 +193,9 @@ def _build_model(
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_PLANE, pos=position, quat=quaternion, size=[0, 0, 1], **surface
         )
+    for i, piece in enumerate([] if walls is None else wall_pieces(bin_size, walls)):
+        spec.add_mesh(name=f"wall_{i}", uservert=piece.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"wall_{i}", **surface)
     for kind in np.unique(part_ids):
         for i, hull in enumerate(solids[kind].hulls):
             spec.add_mesh(
