@@ -129,6 +129,12 @@ def test_the_parts_of_a_set_have_one_cell() -> None:
         ("object.cell.distance=-1", "object.cell.distance must be greater than 0 and at most 100; got -1"),
         ("+object.cell.distanc=1", "there is no setting 'object.cell.distanc', did you mean 'object.cell.distance'"),
         ("object.cell.bin.walls.radius=0.05", "radius must be at most half of the bin's shorter side"),
+        (
+            "object.cell.distance=0.9",
+            "distance must lie within 0.384..0.52 m, the range of phoxi_s, got 0.9: take 0.52",
+        ),
+        ("object.cell.bin.size=[0.36,0.28,0.1]", "distance must be at least 0.577 m, from where on the picture holds"),
+        ("object.cell.sensor=phoxi", "object.cell.sensor must be one of phoxi_s, phoxi_m"),
         ("object.cell.measures.preset=foxi", "object.cell.measures.preset must be one of none, gaussian, phoxi"),
     ],
 )

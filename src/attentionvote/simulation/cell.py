@@ -16,6 +16,7 @@ from attentionvote.setting import Setting
 from attentionvote.simulation.bin_walls import Walls
 from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.sensor import Sensor
+from attentionvote.simulation.sensor_models import CUSTOM, SENSOR_MODELS
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,10 @@ class CellSettings:
 
     Raises:
         SettingError: when a setting is out of its range.
-        ValueError: when the walls do not fit the bin.
+        ValueError: when the walls do not fit the bin, or the sensor does not measure it from that distance.
     """
 
-    sensor: Annotated[str, Setting("Name of the sensor model, or custom.")]
+    sensor: Annotated[str, Setting("Name of the sensor model, or custom.", choices=(*SENSOR_MODELS, CUSTOM))]
     distance: Annotated[float, Setting("Metres from the camera to the bin's middle.", above=0, high=100)]
     bin: CellBin
     camera: Camera
@@ -63,6 +64,19 @@ class CellSettings:
 
     def __post_init__(self) -> None:
         check(self)
+        model = SENSOR_MODELS.get(self.sensor)
+        if model is not None and not model.near <= self.distance <= model.far:
+            raise ValueError(
+                f"cell distance must lie within {model.near:g}..{model.far:g} m, the range of {self.sensor}, got "
+                f"{self.distance:g}: take {np.clip(self.distance, model.near, model.far):g}"
+            )
+        least = fitting_distance(self.camera, self.bin.size, self.bin.walls)
+        if self.distance < least - 1e-9:
+            size = " x ".join(f"{side:g}" for side in self.bin.size)
+            raise ValueError(
+                f"cell distance must be at least {np.ceil(least * 1000) / 1000:g} m, from where on the picture holds "
+                f"the bin of {size} m; got {self.distance:g}"
+            )
 
 
 def fitting_distance(camera: Camera, size: tuple[float, float, float], walls: Walls) -> float:
