@@ -5,8 +5,12 @@ from __future__ import annotations
 import logging
 from typing import NamedTuple
 
+import numpy as np
+
 from attentionvote.part import Part, Parts
 from attentionvote.simulation.camera import REFERENCE_DISTANCE, Camera
+from attentionvote.simulation.cell import fitting_distance
+from attentionvote.simulation.cell_choice import walls_for
 from attentionvote.simulation.drop_settings import REFERENCE_DIAMETER
 from attentionvote.simulation.scene_spec import SimulationSettings
 from attentionvote.simulation.sensor import Sensor
@@ -29,6 +33,7 @@ class Resolution(NamedTuple):
         pixels: across D.
         points: on a part that is seen whole, at most as many as its pixels; normals are made of these.
         noise: standard deviation along the ray, metres, seen straight on.
+        bin: inner size in metres, where it is one of the world's.
     """
 
     part: str
@@ -37,6 +42,7 @@ class Resolution(NamedTuple):
     pixels: float
     points: float
     noise: float
+    bin: tuple[float, float, float] | None = None
 
     @property
     def noise_share(self) -> float:
@@ -61,20 +67,37 @@ class Resolution(NamedTuple):
             problems.append(f"{self.points:.0f} points on a part are too few for its normals")
         if not problems:
             return ""
-        better = [f"{name} at {model.best * 1000:.0f} mm" for name, model in SENSOR_MODELS.items() if self._suits(name)]
+        better, smaller_bin = self._better(self.bin), ""
+        if not better and self.bin is not None:
+            better, smaller_bin = self._better(None), " over a smaller bin"
         return f"{' and '.join(problems)}; " + (
-            f"take {' or '.join(better[:3])}"
+            f"take {' or '.join(better[:3])}{smaller_bin}"
             if better
             else "no sensor that is known here measures so small a part well"
         )
 
-    def _suits(self, name: str) -> bool:
-        model = SENSOR_MODELS[name]
-        quiet = model.noise(model.best) <= TOLERATED_NOISE * self.diameter
-        return quiet and model.camera.fx * self.diameter / model.best >= 15  # pixels across, of which 100 are on it
+    def _better(self, size: tuple[float, float, float] | None) -> list[str]:
+        """Sensors, and from where, whose noise and pixels suit the part, and whose picture holds the bin."""
+        found = []
+        for name, model in SENSOR_MODELS.items():
+            least = 0.0 if size is None else fitting_distance(model.camera, size, walls_for(size))
+            distance = round(max(model.best, float(np.ceil(least * 1000)) / 1000), 3)
+            quiet = model.noise(distance) <= TOLERATED_NOISE * self.diameter
+            # As many pixels across as put 100 on the part.
+            if distance <= model.far and quiet and model.camera.fx * self.diameter / distance >= 15:
+                found.append(f"{name} at {distance * 1000:.0f} mm")
+        return found
 
 
-def resolution(parts: Parts, camera: Camera, distance: float, sensor: Sensor, density: int, count: int) -> Resolution:
+def resolution(
+    parts: Parts,
+    camera: Camera,
+    distance: float,
+    sensor: Sensor,
+    density: int,
+    count: int,
+    size: tuple[float, float, float] | None = None,
+) -> Resolution:
     """Figures of the smallest part.
 
     Args:
@@ -84,11 +107,14 @@ def resolution(parts: Parts, camera: Camera, distance: float, sensor: Sensor, de
         sensor: its noise.
         density: most points of a cloud.
         count: parts in the bin that share them.
+        size: of the bin inside, metres, where it is one of the world's.
     """
     part: Part = min(parts.parts, key=lambda member: member.diameter)
     pixel = distance / camera.fx  # metres
     points = min(_silhouette(part) / (pixel * distance / camera.fy), density / count)
-    return Resolution(part.name, part.diameter, distance, part.diameter / pixel, points, noise_of(sensor, distance))
+    return Resolution(
+        part.name, part.diameter, distance, part.diameter / pixel, points, noise_of(sensor, distance), size
+    )
 
 
 def noise_of(sensor: Sensor, distance: float) -> float:
@@ -116,7 +142,9 @@ def log_resolution(
     """Say before any work what the sensor can tell of the smallest part, with a warning where that is too little; the
     noise only where the sensor is known."""
     distance = simulated_distance(parts, settings)
-    found = resolution(parts, settings.camera.camera, distance, sensor or Sensor(), density, settings.drop_counts[-1])
+    size = settings.bin.size if settings.bin.walls is not None else None
+    count = settings.drop_counts[-1]
+    found = resolution(parts, settings.camera.camera, distance, sensor or Sensor(), density, count, size)
     log.info("%s", found.sentence())
     if advice := found.advice():
         log.warning("%s", advice)

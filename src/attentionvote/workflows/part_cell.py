@@ -44,7 +44,7 @@ def cell_of(cfg: PartSettings, vertices: NDArray, faces: NDArray, diameter: floa
     if cell.area is not None:
         log.info("parts are dropped over %s mm of the bin's floor: a heap of %d", _mm(cell.area), count)
     measures = cell.measures or Sensor("gaussian")
-    found = resolution(part, cell.camera, cell.distance, measures, _DENSITY, count)
+    found = resolution(part, cell.camera, cell.distance, measures, _DENSITY, count, cell.bin.size)
     log.info("%s", found.sentence())
     if advice := found.advice():
         log.warning("%s", advice)
