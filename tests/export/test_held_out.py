@@ -128,8 +128,8 @@ def test_of_a_cell_the_whole_bin_counts(part: Part, tmp_path: Path) -> None:
     (near, far), extent = held_out.working_volume(clouds, scenes)
     assert extent == pytest.approx(10 * part.diameter)
     # From the rim, two thirds of its height above the point looked at, to the floor, whatever the distance was.
-    assert near < (12 * 1.05 - 2 / 3 * 2) * part.diameter
-    assert far > (12 * 0.95 + 1 / 3 * 2 - 0.1) * part.diameter
+    assert near == pytest.approx((12 * 0.95 - 2 / 3 * 2) * part.diameter)
+    assert far == pytest.approx((12 * 1.05 + 1 / 3 * 2) * part.diameter)
     heap = max(np.ptp(clouds[index].points, axis=0).max() for index in range(len(clouds)))
     assert heap < extent / 2
 

@@ -15,7 +15,6 @@ from attentionvote.data.dataset_splits import DatasetSplits
 from attentionvote.data.samples import Batch, collate, draw_sample
 from attentionvote.data.sensing import CloudSettings, sense
 from attentionvote.datasets import UnknownLayout
-from attentionvote.geometry.pose import apply
 from attentionvote.model.neighborhoods import Layout
 from attentionvote.part import Parts
 from attentionvote.simulation.raycast import PartCaster
@@ -105,8 +104,9 @@ def samples(clouds: Clouds, indices: list[int], points: int, layout: Layout) -> 
 def working_volume(clouds: Clouds, scenes: SceneSet | DatasetSplit) -> tuple[tuple[float, float], float]:
     """Nearest and farthest depth, and the largest side of the box around a cloud, over all scenes, metres.
 
-    Of a cell, whose bin is one of the world's (it has walls), the whole bin counts, wherever in it the piles lay: what
-    is sent there is the bin's inside, full or nearly empty.
+    Of a cell, whose bin is one of the world's (it has walls), the whole bin counts, wherever in it the piles lay, from
+    the rim at the least distance that training draws to the floor at the largest: what is sent there is the bin's
+    inside, full or nearly empty.
     """
     near, far, extent = np.inf, 0.0, 0.0
     for index in range(len(clouds)):
@@ -117,10 +117,6 @@ def working_volume(clouds: Clouds, scenes: SceneSet | DatasetSplit) -> tuple[tup
             extent = max(extent, float((high - low).max()))
     if not extent > 0:
         raise ValueError("the test scenes must hold parts that can be seen, got only empty ones")
-    for record in scenes.records if isinstance(scenes, SceneSet) else ():
-        if record.walls is None:
-            continue
-        depths = apply(record.camera_from_bin, np.array([[0.0, 0.0, record.bin_size[2]], [0.0, 0.0, 0.0]]))[:, 2]
-        near, far = min(near, float(depths[0])), max(far, float(depths[1]))
-        extent = max(extent, float(record.bin_size.max()))
+    if isinstance(scenes, SceneSet) and (cell := scenes.cell_volume) is not None:
+        near, far, extent = min(near, cell[0]), max(far, cell[1]), max(extent, cell[2])
     return (near, far), extent
