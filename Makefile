@@ -17,6 +17,10 @@ NAME ?=
 MESH ?=
 UNITS ?=
 BODY ?=
+SENSOR ?=
+BIN ?=
+DISTANCE ?=
+CAMERA ?=
 RUN ?=
 TRIALS ?=
 TO ?=
@@ -30,6 +34,8 @@ ifneq ($(CONF),)
 export ATTENTIONVOTE_CONF := $(abspath $(CONF))
 endif
 object := $(if $(OBJECT),object=$(OBJECT))
+# Of a new part's cell.
+cell = $(if $(SENSOR),sensor=$(SENSOR)) $(if $(BIN),"bin='$(BIN)'") $(if $(DISTANCE),distance=$(DISTANCE)) $(if $(CAMERA),"camera='$(CAMERA)'")
 # Of one training, each with a GPU of its own (docs/several-processes.md).
 PROCESSES ?=
 several := $(if $(PROCESSES),pipelines/start_processes.py --standalone --nproc-per-node=$(PROCESSES))
@@ -154,9 +160,9 @@ check-data: $(STAMP) ## Look at a dataset (IPA, Sileane or BOP layout): what it 
 write-data: $(STAMP) ## Write generated scenes as IPA or BOP data: OBJECT=gear [ARGS="format=bop split=test"]
 	@$(PY) pipelines/write_data.py $(object) $(ARGS)
 
-part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.step [UNITS=mm BODY=1]; then `make train OBJECT=bracket`
+part: $(STAMP) ## Add your own part: NAME=bracket MESH=bracket.step [UNITS=mm BODY=1 SENSOR=phoxi_m BIN=360x280x160 DISTANCE=800]
 	@$(PY) pipelines/part.py $(if $(NAME),name=$(NAME)) $(if $(MESH),"mesh='$(MESH)'") $(if $(UNITS),units=$(UNITS)) \
-		$(if $(BODY),body=$(BODY)) $(ARGS)
+		$(if $(BODY),body=$(BODY)) $(cell) $(ARGS)
 
 ui: $(STAMP) ## Open the tracked runs in a browser (MLflow)
 	@$(PY) pipelines/ui.py $(ARGS)

@@ -26,6 +26,7 @@ log = logging.getLogger("attentionvote.generate")
 def run(cfg: GenerateSettings) -> dict[str, Any]:
     """Generate every asked-for split; digests and counts per split."""
 
+    from attentionvote.simulation.resolution import log_resolution
     from attentionvote.simulation.scene_set import generate_scene_set
     from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
 
@@ -38,6 +39,7 @@ def run(cfg: GenerateSettings) -> dict[str, Any]:
     unknown = [split for split in cfg.splits if split not in specs]
     if unknown or not cfg.splits:
         raise ConfigurationError(f"splits must be among {', '.join(specs)}; got {list(cfg.splits)}")
+    log_resolution(log, part, cfg.simulation)
     sets = {}
     for split in cfg.splits:
         directory = scene_set_directory(Path(cfg.root), part.name, specs[split])

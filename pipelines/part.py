@@ -1,6 +1,6 @@
 """Add your own part: checks the mesh, finds diameter, frame and symmetry, writes conf/object/NAME.yaml.
 
-make part NAME=widget MESH=widget.step [UNITS=mm BODY=1]; then: make train OBJECT=widget
+make part NAME=widget MESH=widget.step [BODY=1 SENSOR=phoxi_m BIN=360x280x160 DISTANCE=800]
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from attentionvote.command.conf_folder import new_file
 from attentionvote.command.entry import command, configuring
 from attentionvote.command.errors import ConfigurationError
 from attentionvote.files import whole, write_whole
+from attentionvote.workflows.part_cell import cell_facts, cell_of
 from attentionvote.workflows.settings import PartSettings
 
 log = logging.getLogger("attentionvote.part")
@@ -35,9 +36,9 @@ def run(cfg: PartSettings) -> dict[str, Any]:
     from attentionvote.cad.part_import import import_part
     from attentionvote.cad.part_picture import write_picture
     from attentionvote.cad.part_report import examine
-    from attentionvote.cad.symmetry_detection import describe
     from attentionvote.geometry import pose
     from attentionvote.part import Part
+    from attentionvote.simulation.cell_text import cell_text
 
     with configuring():
         imported = import_part(cfg.mesh, cfg.units, cfg.body, Path(cfg.parts) / f"{name}-refused.png")
@@ -46,26 +47,22 @@ def run(cfg: PartSettings) -> dict[str, Any]:
         diameter = largest_vertex_distance(vertices)
         size = " x ".join(f"{e * 1000:.1f}" for e in vertices.max(0) - vertices.min(0))
         log.info("%s: %d triangles, %s mm, D %.2f mm; looking for symmetries", name, len(faces), size, diameter * 1e3)
+        cell = cell_of(cfg, vertices, faces, diameter)
         report = examine(vertices, faces, cfg.tolerance)
         finding = report.finding
         vertices = pose.apply(finding.part_from_file, vertices)
         check_written(vertices, faces, Path(cfg.mesh).name)
     title = cfg.title or name.replace("_", " ").capitalize()
     part = Part(name, vertices, faces, round(diameter, 9), finding.symmetry, str(title))
-    log.info("symmetry %s, residual %.3f mm", describe(finding.symmetry), finding.residual * 1e3)
-    if report.hidden:
-        log.info(" ".join(report.hidden_lines))
-    for twin in report.near_symmetric:
-        log.info("nearly symmetric: turned by %s the part is %.0f %% alike", twin["quaternion"], 100 * twin["overlap"])
-    if not report.is_mirror_symmetric:
-        log.info("the part's mirror image is %s", report.mirror_line)
+    for line in report.lines:
+        log.info("%s", line)
     if finding.moved:
         log.info("the part frame is not the file's: see part_from_file in %s", config)
 
     mesh, picture = Path(cfg.parts) / f"{name}.ply", Path(cfg.parts) / f"{name}.png"
     whole(mesh, lambda path: write_surface(part.vertices, part.faces, path))
     whole(picture, lambda path: write_picture(part, path))
-    write_whole(config, configuration_text(part, report, mesh, imported.line))
+    write_whole(config, configuration_text(part, report, mesh, imported.line) + cell_text(cell))
     log.info("look at %s, then: make train OBJECT=%s", picture, name)
     return {
         "stage": "part",
@@ -78,17 +75,9 @@ def run(cfg: PartSettings) -> dict[str, Any]:
         "surface_moved": imported.moved,
         "diameter": part.diameter,
         "covariance_root": part.covariance_root.round(9),
+        "cell": cell_facts(cell),
         "symmetry": symmetry_settings(part),
-        "symmetry_residual": finding.residual,
-        "symmetry_tolerance": finding.tolerance,
-        "runner_up": finding.runner_up,
-        "runner_up_residual": finding.runner_up_residual if finding.runner_up_residual < 1e9 else None,
-        "hidden_symmetry": describe(report.hidden.symmetry) if report.hidden else None,
-        "hidden_symmetry_residual": report.hidden.residual if report.hidden else None,
-        "near_symmetric": report.near_symmetric,
-        "mirror_image": report.mirror,
-        "moved": finding.moved,
-        "part_from_file": finding.part_from_file.round(9),
+        **report.facts,
     }
 
 

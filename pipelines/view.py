@@ -24,12 +24,12 @@ def run(cfg: ViewSettings) -> dict[str, Any]:
     from attentionvote.simulation.scene_set import find_record
     from attentionvote.simulation.scene_spec import scene_set_directory, scene_set_specs
     from attentionvote.simulation.scene_view import write_view
-    from attentionvote.simulation.sensor import Sensor, synthesize
+    from attentionvote.simulation.sensor import synthesize
 
     with configuring(f"object {cfg.object.name}"):
         part = cfg.object()
     with configuring():
-        sensor = Sensor(cfg.sensor, sigma_mm=cfg.sigma_mm)
+        sensor = cfg.shown_sensor
         specs = scene_set_specs(part, cfg.simulation)
     if cfg.split not in specs:
         raise ConfigurationError(f"split must be one of {', '.join(specs)}; got {cfg.split!r}")

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_args, get_origin
 
 from attentionvote.setting import (
     Field,
+    Identity,
     Setting,
     SettingError,
     fields_of,
@@ -249,6 +250,18 @@ def _value(key: str, value: Any, type_: Any, setting: Setting) -> Any:
     if setting.problem is not None and (problem := setting.problem(value)):
         raise SettingError(f"{key} {problem}")
     return value
+
+
+def identifying(section: Any) -> dict[str, Any]:
+    """A section made in code as plain values, as ``dataclasses.asdict``, but for fields that came later and are at the
+    default that changes nothing (``Identity.CHANGED``): digests of before they came stay the same."""
+    plain = {}
+    for name, field in fields_of(type(section)).items():
+        value = getattr(section, name)
+        if field.setting.identity is Identity.CHANGED and value == field.default:
+            continue
+        plain[name] = identifying(value) if dataclasses.is_dataclass(value) else value
+    return plain
 
 
 def leaves(section: Any, key: str = "") -> Iterator[tuple[str, Field]]:

@@ -13,7 +13,8 @@ from surface_symmetry import symmetry_residual
 
 from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
 from attentionvote.cad.mesh_file import largest_vertex_distance, load_surface
-from attentionvote.cad.symmetry_detection import describe, detect_symmetry, hidden_symmetry
+from attentionvote.cad.symmetry_detection import detect_symmetry, hidden_symmetry
+from attentionvote.cad.symmetry_groups import describe
 from attentionvote.geometry.pose import (
     apply,
     inverse,

@@ -22,6 +22,7 @@ from attentionvote.simulation import cycle
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_set import SceneSet, generate_scene_set
 from attentionvote.simulation.scene_spec import SimulationSettings, scene_set_directory, scene_set_specs
+from attentionvote.simulation.sensor import Sensor
 
 CAMERA = {"width": 344, "height": 257, "fx": 567.0, "fy": 567.0, "cx": 172.0, "cy": 128.5}
 SETTINGS: dict[str, Any] = {
@@ -105,13 +106,32 @@ def test_samples_and_sensor_clouds_are_of_the_same_measurement(
     assert 500 < len(whole) <= settings.density
     sampled = {tuple(p) for p in drawn[1].points[0].numpy().tolist()}
     assert sampled <= {tuple(p) for p in whole.tolist()}
-    (near, far), extent = held_out.working_volume(clouds)
+    (near, far), extent = held_out.working_volume(clouds, scenes)
     low, high = whole.min(0), whole.max(0)
     assert near <= low[2] + 0.002 < high[2] - 0.002 <= far
     assert extent >= (high - low).max() - 0.002
     card = model_card(network, metadata, part, (near, far), extent, "run", "commit")
     assert (card.points, card.votes, card.proposals, card.density) == (300, 32, 8, 2000)
     assert type(card).from_json(card.to_json()) == card
+
+
+def test_of_a_cell_the_whole_bin_counts(part: Part, tmp_path: Path) -> None:
+    """A heap in a corner of a wide bin: the cell will send all of the bin, which is no other scene than was trained."""
+    wide = {
+        "bin": {"size": [10 * part.diameter, 8 * part.diameter, 2 * part.diameter], "jitter": 0.0, "walls": {}},
+        "camera": SETTINGS["camera"] | {"distance": 12 * part.diameter},
+        "drop": SETTINGS["drop"] | {"area": [1.5 * part.diameter, 1.5 * part.diameter]},
+    }
+    spec = scene_set_specs(part, read(SimulationSettings, SETTINGS | wide))["test"]
+    scenes = generate_scene_set(part, spec, scene_set_directory(tmp_path, part.name, spec), progress=False)
+    clouds = held_out.measured(scenes, part, CloudSettings(Sensor(), 2000, 1000), tmp_path, workers=1)
+    (near, far), extent = held_out.working_volume(clouds, scenes)
+    assert extent == pytest.approx(10 * part.diameter)
+    # From the rim, two thirds of its height above the point looked at, to the floor, whatever the distance was.
+    assert near == pytest.approx((12 * 0.95 - 2 / 3 * 2) * part.diameter)
+    assert far == pytest.approx((12 * 1.05 + 1 / 3 * 2) * part.diameter)
+    heap = max(np.ptp(clouds[index].points, axis=0).max() for index in range(len(clouds)))
+    assert heap < extent / 2
 
 
 def test_a_card_needs_a_finished_training(network: AttentionVote, metadata: dict[str, Any], part: Part) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from attentionvote.simulation.bin_walls import Walls
 from attentionvote.simulation.scene_record import SceneRecord, load_records, save_records
 
 
@@ -26,6 +27,18 @@ def test_what_is_loaded_is_what_was_saved(scene_record: Callable[..., SceneRecor
         assert (b.cycle, b.drop_count, b.camera, b.friction, b.scene_seed) == (
             a.cycle, a.drop_count, a.camera, a.friction, a.scene_seed,
         )  # fmt: skip
+
+
+def test_walls_are_kept_where_there_are_some(scene_record: Callable[..., SceneRecord], tmp_path: Path) -> None:
+    walls = Walls(thickness=0.002, radius=0.02, draft_degrees=3)
+    save_records(tmp_path / "a.npz", [replace(scene_record(count), walls=walls) for count in (1, 2)])
+    save_records(tmp_path / "b.npz", [scene_record(1)])
+    loaded = load_records(tmp_path / "a.npz")
+    assert [record.walls for record in loaded] == [walls, walls]
+    assert loaded[0].bin_surface.walls == walls
+    assert [record.walls for record in load_records(tmp_path / "b.npz")] == [None]
+    with np.load(tmp_path / "b.npz") as stored:
+        assert "walls" not in stored.files  # what has none looks as it always did
 
 
 def test_a_cycle_without_scenes(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from attentionvote.part import Part
 from attentionvote.section import read
 from attentionvote.setting import SettingError
+from attentionvote.simulation.bin_walls import Walls
 from attentionvote.simulation.camera import Camera, CameraSettings
 from attentionvote.simulation.drop_settings import BinSettings, DropSettings
 from attentionvote.simulation.scene_spec import SceneSetSpec, SimulationSettings, scene_set_directory, scene_set_specs
@@ -47,6 +48,14 @@ def test_the_digest_does_not_depend_on_how_the_values_were_written() -> None:
 
 def test_a_set_that_keeps_all_has_the_digest_of_before_it_could_keep_less() -> None:
     assert SPEC.digest() == "50102b90a47fad025f336c451a6ea8689085edcc65b97c97175dc6cb83442d1b"  # of commit 83d427a
+
+
+def test_what_came_later_changes_a_digest_only_where_it_is_used() -> None:
+    later = [replace(SPEC, bin=BinSettings(walls=Walls())), replace(SPEC, drop=DropSettings(area=(0.1, 0.1)))]
+    assert len({spec.digest() for spec in (SPEC, *later)}) == 3
+    assert "walls" not in SPEC.as_dict()["bin"]
+    assert later[0].as_dict()["bin"]["walls"]["radius"] == Walls().radius
+    assert replace(SPEC, bin=BinSettings(walls=Walls(radius=0.02))).digest() != later[0].digest()
 
 
 def test_cycles_in_turn_keep_all_counts_between_them() -> None:

@@ -8,13 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from attentionvote.geometry.pose import transform
 from attentionvote.part import Part
 from attentionvote.scene import Scene
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
-from attentionvote.simulation.sensor import Sensor, synthesize
+from attentionvote.simulation.sensor import Sensor, alike_noise, synthesize
 
 Records = Callable[..., SceneRecord]
 ALL = 10**6
@@ -182,6 +184,54 @@ def test_the_default_scanner_loses_a_plausible_share(caster: PartCaster, scene_r
     record = scene_record(8, seed=2)
     share = len(cloud(record, caster, Sensor("phoxi")).points) / len(cloud(record, caster, Sensor()).points)
     assert 0.5 < share < 0.95
+
+
+def test_lengths_of_a_device_do_not_scale_with_the_distance(caster: PartCaster, scene_record: Records) -> None:
+    """At half of 0.80 m a scaled baseline is half as long: its shadows are those of a device with half the baseline."""
+    record = scene_record(8)
+    half = float(record.camera_from_bin[2, 3]) / 0.8
+    shadow = replace(QUIET, baseline=0.2)
+    fixed = cloud(record, caster, replace(shadow, scaled=False))
+    np.testing.assert_array_equal(
+        fixed.points, cloud(record, caster, replace(QUIET, baseline=0.2 / half, edge_jump=0.003 / half)).points
+    )
+    assert len(fixed.points) < len(cloud(record, caster, shadow).points)
+
+
+@given(st.floats(1.5, 20), st.integers(0, 100))
+def test_alike_noise_has_variance_one_and_fades_over_its_pixels(spacing: float, seed: int) -> None:
+    pixels = np.stack(np.meshgrid(np.arange(-20, 180), np.arange(150)), axis=2).reshape(-1, 2).astype(np.int32)
+    noise = alike_noise(pixels, spacing, np.random.default_rng(seed)).reshape(150, 200)
+    cells = 150 * 200 / spacing**2
+    assert abs(noise.var() - 1) < 6 / np.sqrt(cells)
+    beside = (noise[:, 1:] * noise[:, :-1]).mean() / noise.var()
+    far = round(2.2 * spacing)
+    away = (noise[:, far:] * noise[:, :-far]).mean() / noise.var()
+    assert beside > 1 - 1.2 / spacing
+    assert abs(away) < 6 / np.sqrt(cells)
+    # Any order of the pixels, any few of them.
+    some = np.random.default_rng(0).permutation(len(pixels))[:500]
+    assert alike_noise(pixels[some], spacing, np.random.default_rng(seed)).shape == (500,)
+    assert alike_noise(pixels[:0], spacing, np.random.default_rng(seed)).shape == (0,)
+
+
+def test_noise_of_a_stereo_camera_is_alike_beside(caster: PartCaster, scene_record: Records) -> None:
+    record = scene_record(3)
+    exact = cloud(record, caster, QUIET)
+    at = pixels_of(record, exact)
+    truth = dict(zip(map(tuple, at), exact.points[:, 2], strict=True))
+
+    def between_neighbours(sensor: Sensor) -> float:
+        scene = cloud(record, caster, sensor)
+        error = {
+            tuple(p): z - truth[tuple(p)] for p, z in zip(pixels_of(record, scene), scene.points[:, 2], strict=True)
+        }
+        pairs = np.array([(e, error[u + 1, v]) for (u, v), e in error.items() if (u + 1, v) in error])
+        return float(np.corrcoef(pairs.T)[0, 1])
+
+    noisy = replace(QUIET, axial_sigma_mm=0.1)
+    assert abs(between_neighbours(noisy)) < 0.1
+    assert between_neighbours(replace(noisy, noise_pixels=8)) > 0.6
 
 
 def test_a_scene_outside_the_picture_is_empty(caster: PartCaster, scene_record: Records) -> None:

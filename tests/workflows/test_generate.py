@@ -41,6 +41,14 @@ def test_every_split_is_generated_once(tmp_path: Path) -> None:
     assert shard.stat().st_mtime_ns > written
 
 
+def test_what_the_camera_can_tell_is_said_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        run(tmp_path, "splits=[val]", "simulation.camera.distance=0.5")
+    first = next(record.message for record in caplog.records if record.name == "attentionvote.generate")
+    assert "at 500 mm: " in first
+    assert "pixels across, about" in first
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

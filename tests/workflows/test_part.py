@@ -103,6 +103,37 @@ def test_a_file_that_is_open_is_refused_with_a_picture_and_nothing_else(tmp_path
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.*")) == ["cup.stl", "parts/cup-refused.png"]
 
 
+def test_a_part_has_a_cell(mesh_file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        chosen = run(mesh_file, tmp_path, "name=wedge", "units=mm", "bin=360x280x160", "distance=800", "sensor=phoxi_m")
+    assert chosen["cell"] == {
+        "sensor": "phoxi_m", "distance": 0.8, "bin": [0.36, 0.28, 0.16], "area": pytest.approx([0.174, 0.135], abs=0.01)
+    }  # fmt: skip
+    assert "pixels across, about" in caplog.text
+    cell = OmegaConf.load(tmp_path / "object" / "wedge.yaml").cell
+    assert (cell.sensor, cell.distance, cell.bin.walls.draft_degrees) == ("phoxi_m", 0.8, 2.0)
+    # Larger than bins are, and nothing is said of its cell: as before.
+    large = run(mesh_file, tmp_path, "name=large", "units=cm")
+    assert (large["cell"], OmegaConf.load(tmp_path / "object" / "large.yaml").cell) == (None, None)
+    assert "gets no cell" in caplog.text
+    with pytest.raises(ConfigurationError, match="bin must be given for a part of 678 mm"):
+        run(mesh_file, tmp_path, "name=huge", "units=cm", "sensor=phoxi_l")
+    default = run(mesh_file, tmp_path, "name=plain", "units=mm")
+    assert default["cell"]["sensor"] in ("phoxi_s", "phoxi_m")
+
+
+def test_a_part_too_small_for_its_sensor_is_said(
+    mesh_file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    # The file's millimetres read as tenths of them would be: 6 mm long.
+    small = trimesh.load_mesh(mesh_file)
+    small.apply_scale(0.1)
+    small.export(tmp_path / "small.stl")
+    run(tmp_path / "small.stl", tmp_path, "name=small", "units=mm", "sensor=realsense_d435")
+    assert "AP at 5 % D will be near 0" in caplog.text
+    assert "take phoxi_s at 442 mm" in caplog.text
+
+
 def test_an_object_is_replaced_only_by_force(mesh_file: Path, tmp_path: Path) -> None:
     run(mesh_file, tmp_path, "name=wedge", "units=mm")
     config = tmp_path / "object" / "wedge.yaml"
@@ -124,6 +155,13 @@ def test_an_object_is_replaced_only_by_force(mesh_file: Path, tmp_path: Path) ->
         (["name=wedge", "units=feet"], "units must be one of m, cm, mm, inch"),
         (["name=wedge", "units=mm", "tolerance=0.5"], "tolerance must be greater than 0 and at most 0.05; got 0.5"),
         (["name=wedge", "mesh=nowhere.stl"], "mesh file 'nowhere.stl' does not exist"),
+        (["name=wedge", "units=mm", "sensor=phoxi"], "sensor must be one of phoxi_s, phoxi_m, .*; got 'phoxi'"),
+        (
+            ["name=wedge", "units=mm", "sensor=phoxi_s", "distance=800"],
+            "must lie within 384..520 mm, .* got 800: take 520",
+        ),
+        (["name=wedge", "units=mm", "bin=huge"], "bin must be inner length x width x height in mm, e.g. 360x280x160"),
+        (["name=wedge", "units=mm", "sensor=custom", "camera=no.json"], "camera file 'no.json' does not exist"),
         (["name=wedge", "mesh=''"], "mesh must be given, e.g. mesh=widget.stl"),
     ],
 )

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from attentionvote.cad.mesh_file import largest_vertex_distance
-from attentionvote.cad.symmetry_detection import describe, detect_symmetry, tested_rotations
+from attentionvote.cad.symmetry_detection import detect_symmetry
+from attentionvote.cad.symmetry_groups import describe, tested_rotations
 from attentionvote.geometry.pose import apply, transform
 from attentionvote.part import Part, surface_moments
 

@@ -23,7 +23,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
 
 def configuration_text(part: Part, report: PartReport, mesh: Path, source: str) -> str:
     """The object's configuration file, every figure with what it is and how it was found."""
-    from attentionvote.cad.symmetry_detection import describe
+    from attentionvote.cad.symmetry_groups import describe
 
     d, finding = part.diameter, report.finding
     root = "; ".join(" ".join(f"{v + 0.0:.7f}" for v in row) for row in part.covariance_root.round(7))

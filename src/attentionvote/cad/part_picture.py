@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from attentionvote.cad.surface_distance import SurfaceDistance
-from attentionvote.cad.symmetry_detection import describe
+from attentionvote.cad.symmetry_groups import describe
 from attentionvote.part import Part
 
 Array = NDArray[np.float64]

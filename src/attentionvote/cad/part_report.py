@@ -10,13 +10,8 @@ from numpy.typing import NDArray
 
 from attentionvote.cad.mesh_file import largest_vertex_distance
 from attentionvote.cad.near_symmetry import Twin, mirror_image, near_symmetries
-from attentionvote.cad.symmetry_detection import (
-    UNSEEN,
-    SymmetryFinding,
-    describe,
-    detect_symmetry,
-    hidden_symmetry,
-)
+from attentionvote.cad.symmetry_detection import UNSEEN, SymmetryFinding, detect_symmetry, hidden_symmetry
+from attentionvote.cad.symmetry_groups import describe
 from attentionvote.geometry import pose
 
 Array = NDArray[np.float64]
@@ -49,6 +44,38 @@ class PartReport:
             f"A sensor that cannot see {self.hidden.residual * 1e3:.3f} mm (a thread, an engraved mark) sees",
             f'{describe(self.hidden.symmetry)}: if yours cannot, make the part again with ARGS="tolerance={UNSEEN}".',
         ]
+
+    @property
+    def lines(self) -> list[str]:
+        """What is worth telling the part's owner, a line each."""
+        finding = self.finding
+        lines = [f"symmetry {describe(finding.symmetry)}, residual {finding.residual * 1e3:.3f} mm"]
+        if self.hidden:
+            lines.append(" ".join(self.hidden_lines))
+        lines += [
+            f"nearly symmetric: turned by {twin['quaternion']} the part is {twin['overlap']:.0%} alike"
+            for twin in self.near_symmetric
+        ]
+        if not self.is_mirror_symmetric:
+            lines.append(f"the part's mirror image is {self.mirror_line}")
+        return lines
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The same as plain values, metres."""
+        finding, hidden = self.finding, self.hidden
+        return {
+            "symmetry_residual": finding.residual,
+            "symmetry_tolerance": finding.tolerance,
+            "runner_up": finding.runner_up,
+            "runner_up_residual": finding.runner_up_residual if finding.runner_up_residual < 1e9 else None,
+            "hidden_symmetry": describe(hidden.symmetry) if hidden else None,
+            "hidden_symmetry_residual": hidden.residual if hidden else None,
+            "near_symmetric": self.near_symmetric,
+            "mirror_image": self.mirror,
+            "moved": finding.moved,
+            "part_from_file": finding.part_from_file.round(9),
+        }
 
     @property
     def mirror_line(self) -> str:

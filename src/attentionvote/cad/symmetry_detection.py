@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from attentionvote.cad.mesh_file import largest_vertex_distance
 from attentionvote.cad.part_frame import SNAP_ANGLE, axis_of, nearest_fixed_point, principal_frame, turned
 from attentionvote.cad.rotation_check import RotationCheck
+from attentionvote.cad.symmetry_groups import describe, generators, group_size, tested_rotations
 from attentionvote.cad.symmetry_search import closure, quaternions_of, refine_axis, search_axes, turns_about
 from attentionvote.geometry import pose
 from attentionvote.geometry.symmetry import Axis, Symmetry
@@ -41,8 +42,6 @@ THIN = 0.1  # of the part's thickness: a sheet is not turned over within a toler
 EQUAL_MOMENTS = 0.04  # relative difference of principal radii below which they may be equal
 LARGEST_ORDER = 180
 MOST_ORDERS = 12  # that are looked at closely; divisors of the right one fit as well as it does
-# Turns by multiples of the golden angle: no small part of a full turn, so no finite group contains them.
-REVOLUTION_ANGLES = np.mod(2 * np.pi * np.arange(1, 17) * (5**0.5 - 1) / 2, 2 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
     check = RotationCheck(vertices - centroid, faces, limit)
     detection = _Detection(check, covariance)
     symmetry = _tidy(detection.group())
-    centre = centroid + check.centre(_generators(symmetry)) if symmetry.kind != "none" else centroid
+    centre = centroid + check.centre(generators(symmetry)) if symmetry.kind != "none" else centroid
     part_from_file = principal_frame(symmetry, vertices, centre, covariance, diameter)
     moved = not np.array_equal(part_from_file, np.eye(4))
     # The last word: the symmetry exactly as it will be written, about the origin that it will be written for.
@@ -124,46 +123,6 @@ def hidden_symmetry(vertices: Array, faces: NDArray[np.int64], finding: Symmetry
     return larger if group_size(larger.symmetry) > group_size(finding.symmetry) else None
 
 
-def group_size(symmetry: Symmetry) -> float:
-    """Number of rotations of the group; of a body of revolution more than of any finite group, with flip the double."""
-    return len(symmetry.rotations()) * (1e6 if symmetry.is_revolution else 1.0)
-
-
-def _generators(symmetry: Symmetry) -> Array:
-    """A few rotations ``(R, 3, 3)`` whose fixed points the whole group shares."""
-    if symmetry.is_revolution:
-        turns = pose.rotation_about(symmetry.axis, np.array([np.pi / 2, np.pi]))
-        return np.concatenate([turns, symmetry.rotations()[1:]])
-    rotations = symmetry.rotations()[1:]
-    far = rotations[np.argsort(np.trace(rotations, axis1=1, axis2=2))]  # small turns tell little of their centre
-    if symmetry.kind == "cyclic":
-        return far[:2]
-    # Half turns about different axes, which all groups with several axes have, and the turns between them.
-    return np.concatenate([far[:3], far[-1:]])
-
-
-def tested_rotations(symmetry: Symmetry) -> Array:
-    """The rotations ``(R, 3, 3)`` that are checked for ``symmetry``: all of a finite group but the identity,
-    16 incommensurable turns of a body of revolution and their products with the flip."""
-    finite = symmetry.rotations()
-    if not symmetry.is_revolution:
-        return finite[1:]
-    turns = pose.rotation_about(symmetry.axis, REVOLUTION_ANGLES)
-    return np.concatenate([turns @ r for r in finite])
-
-
-def describe(symmetry: Symmetry) -> str:
-    """The group in one phrase for people."""
-    axis = "(" + " ".join(f"{round(v, 3) + 0.0:g}" for v in symmetry.axis) + ")"
-    if symmetry.kind == "cyclic":
-        return f"cyclic of order {symmetry.order} about {axis}"
-    if symmetry.kind == "dihedral":
-        return f"dihedral of order {symmetry.order} about {axis}"
-    if symmetry.kind == "revolution":
-        return f"revolution about {axis} {'with' if symmetry.flip else 'without'} flip"
-    return "none" if symmetry.kind == "none" else f"group of {len(symmetry.quaternions)} rotations"
-
-
 class _Detection:
     """Hypotheses in order of size; the rejected ones are remembered for the runner-up."""
 
@@ -193,7 +152,7 @@ class _Detection:
     def _accept(self, symmetry: Symmetry) -> bool:
         """Whether the whole group leaves the surface in place."""
         rotations = tested_rotations(symmetry)
-        centre = self.check.centre(_generators(symmetry))
+        centre = self.check.centre(generators(symmetry))
         if self.check.holds(rotations, centre):
             return True
         if symmetry.order <= 12:  # larger ones turn so little that their residual says nothing

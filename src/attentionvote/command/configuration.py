@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
+from attentionvote.command.cells import with_cell
 from attentionvote.command.conf_folder import CONF, choices, files, folders, groups, is_group, primary_file
 from attentionvote.command.errors import ConfigurationError, nearest, sentence
 from attentionvote.command.words import parse
@@ -116,8 +117,12 @@ def compose(settings: type[Settings], overrides: Sequence[str], conf: Path = CON
             added = override.is_add() or override.is_force_add()
             if override not in group_words and not added and _is_left_out(settings, override, base, conf):
                 words[index] = f"++{override.input_line}"
+    plain = _plain(_compose(name, words, conf))
+    objects = tuple(str(o.input_line) for o in group_words if o.key_or_group == "object")
     try:
-        checked = settings.of(_plain(_compose(name, words, conf)))
+        keys = [o.key_or_group for o in parsed if o not in group_words]
+        plain = with_cell(plain, lambda: _defaults(name, objects, conf, _state(conf)), keys)
+        checked = settings.of(plain)
     except SettingError as error:
         raise ConfigurationError(sentence(error)) from error
     _check_name(checked, parsed, conf)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry.pointcloud import estimate_normals, sample_indices
 from attentionvote.scene import BACKGROUND, Scene
+from attentionvote.section import identifying
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 from attentionvote.simulation.sensor import Sensor, synthesize
@@ -47,7 +48,7 @@ class CloudSettings:
 
     def key(self, scene_digest: str) -> str:
         """Digest of everything that determines the stored clouds."""
-        content = json.dumps([_VERSION, scene_digest, asdict(self)], sort_keys=True, default=str)
+        content = json.dumps([_VERSION, scene_digest, identifying(self)], sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()
 
 

@@ -101,8 +101,13 @@ def samples(clouds: Clouds, indices: list[int], points: int, layout: Layout) -> 
             yield collate([draw_sample(clouds[index], points, layout, None, rng)])
 
 
-def working_volume(clouds: Clouds) -> tuple[tuple[float, float], float]:
-    """Nearest and farthest depth, and the largest side of the box around a cloud, over all scenes, metres."""
+def working_volume(clouds: Clouds, scenes: SceneSet | DatasetSplit) -> tuple[tuple[float, float], float]:
+    """Nearest and farthest depth, and the largest side of the box around a cloud, over all scenes, metres.
+
+    Of a cell, whose bin is one of the world's (it has walls), the whole bin counts, wherever in it the piles lay, from
+    the rim at the least distance that training draws to the floor at the largest: what is sent there is the bin's
+    inside, full or nearly empty.
+    """
     near, far, extent = np.inf, 0.0, 0.0
     for index in range(len(clouds)):
         points = clouds[index].points
@@ -112,4 +117,6 @@ def working_volume(clouds: Clouds) -> tuple[tuple[float, float], float]:
             extent = max(extent, float((high - low).max()))
     if not extent > 0:
         raise ValueError("the test scenes must hold parts that can be seen, got only empty ones")
+    if isinstance(scenes, SceneSet) and (cell := scenes.cell_volume) is not None:
+        near, far, extent = min(near, cell[0]), max(far, cell[1]), max(extent, cell[2])
     return (near, far), extent

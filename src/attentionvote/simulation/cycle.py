@@ -44,14 +44,16 @@ def simulate_cycle(
     counts = spec.counts_of(cycle)
     seeds = {count: seed for count, seed in zip(spec.drop_counts, scene_seeds, strict=True) if count in counts}
     records = []
-    for bin_from_part in drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng, drops=counts[-1]):
+    walls = spec.bin.walls
+    piles = drop_parts(solids, part_ids, bin_size, friction, spec.drop, rng, drops=counts[-1], walls=walls)
+    for bin_from_part in piles:
         count = len(bin_from_part)
         if count not in seeds:
             continue
         scene_rng = np.random.default_rng(seeds[count])
         camera_from_bin = spec.camera.sample(scale, float(bin_size[2]), scene_rng)
         camera_from_part = camera_from_bin @ bin_from_part
-        surface, dropped_ids = BinSurface(bin_size, camera_from_bin), part_ids[:count]
+        surface, dropped_ids = BinSurface(bin_size, camera_from_bin, walls), part_ids[:count]
         records.append(
             SceneRecord(
                 cycle=cycle,
@@ -66,6 +68,7 @@ def simulate_cycle(
                 friction=friction,
                 scene_seed=int(scene_rng.integers(2**63)),
                 part_ids=dropped_ids,
+                walls=walls,
             )
         )
     return records

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from attentionvote.simulation.bin_walls import bin_outlines
+
 if TYPE_CHECKING:
     from attentionvote.simulation.raycast import PartCaster
     from attentionvote.simulation.scene_record import SceneRecord
@@ -58,6 +60,9 @@ def depth_range(records: Sequence[SceneRecord], radius: float) -> tuple[float, f
     for record in records:
         x, y, height = record.bin_size * (0.5, 0.5, 1.0)
         corners = np.array([[sx * x, sy * y, z, 1.0] for sx in (-1, 1) for sy in (-1, 1) for z in (0.0, height)])
+        if record.walls is not None:
+            rings = np.concatenate(bin_outlines(record.bin_size, record.walls))
+            corners = np.concatenate([rings, np.ones((len(rings), 1))], axis=1)
         bin_depth = (record.camera_from_bin @ corners.T)[2]
         part_depth = record.camera_from_part[:, 2, 3]
         low = min(low, bin_depth.min(), part_depth.min(initial=np.inf) - radius)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from attentionvote.geometry.pose import apply, matrix_from_quaternion, random_quaternion, transform
 from attentionvote.part import Part
+from attentionvote.simulation.bin_walls import Walls, wall_pieces
 from attentionvote.simulation.decomposition import Hulls
 from attentionvote.simulation.drop_settings import DropSettings
 from attentionvote.simulation.mass import Mass, mass_properties
@@ -38,10 +39,12 @@ def drop_parts(
     settings: DropSettings,
     rng: np.random.Generator,
     drops: int | None = None,
+    walls: Walls | None = None,
 ) -> Iterator[NDArray[np.float64]]:
     """Drop parts in sequence and yield every pile that came to rest.
 
-    The bin's walls go on invisibly above the rim, as infinite planes: nothing falls out or tunnels through.
+    The bin's walls go on invisibly above the rim, as infinite planes: nothing falls out or tunnels through. Walls with
+    a shape end at the rim, on which parts can lie; the planes stand where the rim ends outside.
     A pile that still moves (> 5 cm/s) after the timeout is left out. The cycle ends early when a part rests above the
     rim (the bin is full), left the bin, or any value is not finite.
 
@@ -53,20 +56,23 @@ def drop_parts(
         settings: physics settings.
         rng: decides places and orientations.
         drops: end after so many; None drops all. The piles are the same.
+        walls: shape of the bin's walls; None are upright and meet squarely.
 
     Yields:
         ``bin_from_part`` ``(k, 4, 4)`` of the first k parts, once per accepted drop.
     """
     count = len(part_ids)
     masses = [mass_properties(solid.part) for solid in solids]
-    model = _build_model(solids, masses, part_ids, bin_size, friction, settings)
+    model = _build_model(solids, masses, part_ids, bin_size, friction, settings, walls)
     data = mujoco.MjData(model)
     vertices = [np.concatenate(solid.hulls) for solid in solids]
     half = np.asarray(bin_size[:2]) / 2
+    middle, reach = _drop_area(half, settings, rng)
+    opening = half if walls is None else half + walls.lean(float(bin_size[2]))
     pile_top = 0.0
     for k, kind in enumerate(part_ids[:drops]):
         height = pile_top + 0.3 * solids[kind].part.diameter
-        _release(model, data, k, vertices[kind], half, height, settings.speed, rng)
+        _release(model, data, k, vertices[kind], middle, reach, height, settings.speed, rng)
         speed = _settle(model, data, k + 1, settings)
         pose = data.qpos.reshape(count, 7)[: k + 1]
         if (
@@ -82,7 +88,7 @@ def drop_parts(
             if not len(poses_of_part):
                 continue
             centres = apply(poses_of_part, centre[None])[:, 0]
-            outside = np.abs(centres[:, :2]) > half
+            outside = np.abs(centres[:, :2]) > opening
             if outside.any() or (centres[:, 2] < 0).any() or (centres[:, 2] > bin_size[2]).any():
                 return
             pile_top = max(pile_top, float(apply(poses_of_part, vertices[i])[..., 2].max()))
@@ -90,24 +96,37 @@ def drop_parts(
             yield bin_from_part
 
 
+def _drop_area(
+    half: NDArray[np.float64], settings: DropSettings, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Middle and half size, each ``(2,)`` metres, of the piece of the floor that parts fall over: somewhere in the bin,
+    along its walls too."""
+    if settings.area is None:
+        return np.zeros(2), half
+    reach = np.minimum(np.array(settings.area) / 2, half)
+    return rng.uniform(-1, 1, size=2) * (half - reach), reach
+
+
 def _release(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     k: int,
     vertices: NDArray[np.float64],
-    half: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    reach: NDArray[np.float64],
     height: float,
     speed: float,
     rng: np.random.Generator,
 ) -> None:
-    """Take part ``k`` from its parking place to a random pose whose lowest point is at ``height``."""
+    """Take part ``k`` from its parking place to a random pose, its lowest point at ``height``, over the floor's piece
+    with that middle and half size."""
     quaternion = random_quaternion(rng)
     turned = vertices @ matrix_from_quaternion(quaternion).T
     low, high = turned.min(axis=0), turned.max(axis=0)
     # Between the walls with its whole extent, in the middle where it is too long for that.
-    first, last = -half - low[:2], half - high[:2]
-    middle = (first + last) / 2
-    center = rng.uniform(np.minimum(first, middle), np.maximum(last, middle))
+    first, last = -reach - low[:2], reach - high[:2]
+    between = (first + last) / 2
+    center = middle + rng.uniform(np.minimum(first, between), np.maximum(last, between))
     data.qpos[7 * k : 7 * k + 7] = [*center, height - low[2], *quaternion]
     data.qvel[6 * k : 6 * k + 6] = [0, 0, -speed, 0, 0, 0]
     model.body_gravcomp[k + 1] = 0.0  # body 0 is the world
@@ -126,6 +145,22 @@ def _settle(model: mujoco.MjModel, data: mujoco.MjData, dropped: int, settings: 
             return float(linear)
 
 
+def _planes(bin_size: NDArray[np.float64], walls: Walls | None) -> list[tuple[list[float], list[float]]]:
+    """Floor and upright planes that end what a part can reach, the walls where they have no shape: a point of each, and
+    the quaternion that turns z to its inward normal."""
+    floor: tuple[list[float], list[float]] = ([0, 0, 0], [1, 0, 0, 0])
+    if walls is not None:  # where the rim ends, upright
+        bin_size = np.array([*walls.outer_size(bin_size), bin_size[2]])
+    x, y, root = bin_size[0] / 2, bin_size[1] / 2, np.sqrt(0.5)
+    return [
+        floor,
+        ([-x, 0, 0], [root, 0, root, 0]),
+        ([x, 0, 0], [root, 0, -root, 0]),
+        ([0, -y, 0], [root, -root, 0, 0]),
+        ([0, y, 0], [root, root, 0, 0]),
+    ]
+
+
 def _build_model(
     solids: Sequence[Solid],
     masses: Sequence[Mass],
@@ -133,6 +168,7 @@ def _build_model(
     bin_size: NDArray[np.float64],
     friction: float,
     settings: DropSettings,
+    walls: Walls | None = None,
 ) -> mujoco.MjModel:
     """A model with every part of the cycle, parked above the bin without weight until its drop."""
     diameters = [solid.part.diameter for solid in solids]
@@ -153,19 +189,13 @@ def _build_model(
         "condim": 3,
         "friction": [friction, 0.005, 0.0001],
     }
-    x, y = bin_size[0] / 2, bin_size[1] / 2
-    root = np.sqrt(0.5)
-    planes: list[tuple[list[float], list[float]]] = [  # position, quaternion that turns z to the inward normal
-        ([0, 0, 0], [1, 0, 0, 0]),
-        ([-x, 0, 0], [root, 0, root, 0]),
-        ([x, 0, 0], [root, 0, -root, 0]),
-        ([0, -y, 0], [root, -root, 0, 0]),
-        ([0, y, 0], [root, root, 0, 0]),
-    ]
-    for position, quaternion in planes:
+    for position, quaternion in _planes(bin_size, walls):
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_PLANE, pos=position, quat=quaternion, size=[0, 0, 1], **surface
         )
+    for i, piece in enumerate([] if walls is None else wall_pieces(bin_size, walls)):
+        spec.add_mesh(name=f"wall_{i}", uservert=piece.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"wall_{i}", **surface)
     for kind in np.unique(part_ids):
         for i, hull in enumerate(solids[kind].hulls):
             spec.add_mesh(

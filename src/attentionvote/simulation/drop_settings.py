@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from attentionvote.part import Parts
 from attentionvote.section import check
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
+from attentionvote.simulation.bin_walls import Walls
 
 # The bin of the IPA-like protocol, for slender parts of 143 mm.
 REFERENCE_DIAMETER = 0.143
@@ -34,11 +35,19 @@ class BinSettings:
     jitter: Annotated[
         float, Setting("Every side is multiplied by 1 - jitter .. 1 + jitter, once per cycle.", low=0, high=0.5)
     ] = 0.15
+    walls: Annotated[
+        Walls | None,
+        Setting("Thickness, rim, corners and draft; null = thin upright walls.", identity=Identity.CHANGED),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.size is not None:
             object.__setattr__(self, "size", tuple(float(s) for s in self.size))
         check(self)
+        if self.size is not None and self.walls is not None:
+            smallest = np.array(self.size) * (1 - self.jitter)
+            if problem := self.walls.problem(smallest):
+                raise ValueError(f"bin {problem}")
 
     def scaling_diameter(self, parts: Parts, count: int) -> float:
         """The diameter in metres, relative to 143 mm, that bin and camera distance scale with.
@@ -84,9 +93,21 @@ class DropSettings:
     hull_vertices: Annotated[int, Setting("Most vertices of one convex piece.", low=8, high=256)] = 64
     speed: Annotated[float, Setting("Downward speed at release, m/s.", above=0, high=5)] = 0.5
     timeout: Annotated[float, Setting("Longest time a drop may take, seconds.", above=0.25, high=30)] = 1.5
+    area: Annotated[
+        tuple[float, float] | None,
+        Setting(
+            "Length and width in metres of the piece of the floor that parts fall over, at a place drawn once per "
+            "cycle; null = the whole floor.",
+            above=0,
+            high=100,
+            identity=Identity.CHANGED,
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "friction", tuple(float(f) for f in self.friction))
+        if self.area is not None:
+            object.__setattr__(self, "area", tuple(float(side) for side in self.area))
         check(self)
         if self.contact_time < 2 * self.timestep:
             raise ValueError(

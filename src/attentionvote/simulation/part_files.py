@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.part import Part, PartSet
 from attentionvote.setting import Identity, Setting
+from attentionvote.simulation.cell import CellSettings
 
 BUILTIN = "builtin:"
 
@@ -34,6 +35,11 @@ def load_part(
     mirror_image: Annotated[
         Any, Setting("How alike the part and its mirror image are.", identity=Identity.NEVER)
     ] = None,
+    # Its values stand in the settings that identify a result (command/cells.py).
+    cell: Annotated[  # noqa: ARG001
+        CellSettings | None,
+        Setting("Sensor, distance and bin; null = the benchmark's, scaled with D.", identity=Identity.NEVER),
+    ] = None,
 ) -> Part:
     """The part that ``conf/object/NAME.yaml`` describes.
 
@@ -47,6 +53,7 @@ def load_part(
         base_radius: override of a scale setting in metres; conf/model takes it from here, not used by the part.
         voxel_size: the same for the voxel size.
         near_symmetric, mirror_image: what ``make part`` found, for people and later stages; not used by the part.
+        cell: sensor, distance and bin; the settings of a verb take it from here, not used by the part.
 
     Raises:
         ValueError: with one sentence, on an unknown built-in, a broken mesh or an impossible symmetry.
@@ -88,6 +95,9 @@ def load_parts(
     title: Annotated[str, Setting("One line for people.", identity=Identity.ONCE)] = "",
     base_radius: Annotated[float | None, Setting("r of the network, metres; null = from D.", above=0, high=10)] = None,
     voxel_size: Annotated[float | None, Setting("Of the heatmap, metres; null = from D.", above=0, high=10)] = None,
+    cell: Annotated[  # noqa: ARG001
+        CellSettings | None, Setting("As of a part; null = the parts' own.", identity=Identity.NEVER)
+    ] = None,
 ) -> PartSet:
     """The set of parts in one bin that ``conf/object/NAME.yaml`` describes.
 
@@ -97,6 +107,7 @@ def load_parts(
             already, in the order of the network's classes; at least two.
         title: one line for people.
         base_radius, voxel_size: as in ``load_part``; left out, derived from D of the largest part.
+        cell: as in ``load_part``; left out, that of the parts.
 
     Raises:
         ValueError: with one sentence, on too few parts, settings that describe none, or two that cannot be told apart.

@@ -7,6 +7,7 @@ embreex has no instancing; rebuilding a BVH per scene grows with the mesh, this 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.spatial import ConvexHull
 from attentionvote.geometry import native
 from attentionvote.geometry.pose import apply, inverse
 from attentionvote.part import Parts
+from attentionvote.simulation.bin_walls import Walls, bin_mesh
 from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.ray_selection import FirstHits, NearestHits, Windows
 
@@ -40,18 +42,25 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class BinSurface:
-    """Floor and thin walls of the bin: ``size`` ``(3,)`` metres inside, ``camera_from_bin`` ``(4, 4)``."""
+    """The bin: ``size`` ``(3,)`` metres inside, ``camera_from_bin`` ``(4, 4)``; ``walls`` None are thin and upright."""
 
     size: Floats
     camera_from_bin: Floats
+    walls: Walls | None = None
 
     def depth(self, xy: Floats) -> Floats:
         """Depth ``(P,)`` of the bin along rays ``(P, 2)``, inf where they miss it.
 
         A ray that enters the box through its open top ends on the floor or the inside of a wall; one that enters
-        through a side has met the outside of that wall.
+        through a side has met the outside of that wall. Walls with a shape are a surface as parts are.
         """
         bin_from_camera = inverse(self.camera_from_bin)
+        if self.walls is not None:
+            scene = _walled_bin(tuple(float(side) for side in self.size), self.walls)[0]
+            rays = np.ones((len(xy), 3), dtype=np.float32)
+            rays[:, :2] = xy
+            hit_depth, face = _cast(scene, bin_from_camera, rays)
+            return np.where(face >= 0, hit_depth, np.inf).astype(np.float64)
         library = native.load("attentionvote.simulation", "rays.c")
         if library is not None:
             depth, rays = np.empty(len(xy)), np.ascontiguousarray(xy, dtype=np.float64)
@@ -75,7 +84,29 @@ class BinSurface:
         """The same bin seen from an origin at ``shift`` ``(3,)`` in the camera frame."""
         pose = self.camera_from_bin.copy()
         pose[:3, 3] -= shift
-        return BinSurface(self.size, pose)
+        return BinSurface(self.size, pose, self.walls)
+
+
+@lru_cache(maxsize=16)
+def _walled_bin(size: tuple[float, float, float], walls: Walls) -> tuple[Any, Any]:
+    """Embree's scene and mesh of a bin, in the bin's frame: the scenes of a cycle share one."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    vertices, faces = bin_mesh(np.array(size), walls)
+    scene = EmbreeScene()
+    return scene, TriangleMesh(scene, vertices[faces].astype(np.float32))
+
+
+def _cast(scene: Any, from_camera: Floats, rays: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays ``(P, 3)`` (x, y, 1) at a scene with its own frame."""
+    if not len(rays):
+        return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int32)
+    direction = rays @ from_camera[:3, :3].T.astype(np.float32)
+    # Embree wants an origin for every ray: all are the same three numbers.
+    origin = as_strided(from_camera[:3, 3].astype(np.float32), direction.shape, (0, 4))
+    out = scene.run(origin, direction, output=1)
+    return out["tfar"], out["primID"]
 
 
 class _Surface(NamedTuple):
@@ -259,13 +290,7 @@ class PartCaster:
         self, kind: int, part_from_camera: Floats, rays: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Depth ``(P,)`` and face ``(P,)``, -1 for a miss, of rays ``(P, 3)`` (x, y, 1) at one instance alone."""
-        if not len(rays):
-            return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int32)
-        direction = rays @ part_from_camera[:3, :3].T.astype(np.float32)
-        # Embree wants an origin for every ray: all are the same three numbers.
-        origin = as_strided(part_from_camera[:3, 3].astype(np.float32), direction.shape, (0, 4))
-        out = self._surfaces[kind].scene.run(origin, direction, output=1)
-        return out["tfar"], out["primID"]
+        return _cast(self._surfaces[kind].scene, part_from_camera, rays)
 
 
 def _kinds(part_ids: NDArray[np.int32] | None, count: int) -> NDArray[np.int32]:

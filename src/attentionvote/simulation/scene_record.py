@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from attentionvote.files import whole
 from attentionvote.geometry.pose import matrix_from_quaternion, quaternion_from_matrix, transform
+from attentionvote.simulation.bin_walls import Walls
 from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.raycast import BinSurface
 
@@ -31,6 +32,7 @@ class SceneRecord:
         friction: sliding friction coefficient of the cycle.
         scene_seed: seed for whatever is drawn anew for the scene (evaluation clouds, for example).
         part_ids: ``(I,)`` int32 which part of the bin's set each instance is; left out, all are the first.
+        walls: shape of the bin's walls; None are thin and upright.
     """
 
     cycle: int
@@ -43,6 +45,7 @@ class SceneRecord:
     friction: float
     scene_seed: int
     part_ids: NDArray[np.int32] = field(default=None)  # type: ignore[arg-type]  # None only until it is filled in
+    walls: Walls | None = None
 
     def __post_init__(self) -> None:
         if self.part_ids is None:
@@ -51,7 +54,7 @@ class SceneRecord:
     @property
     def bin_surface(self) -> BinSurface:
         """Floor and walls in the camera frame."""
-        return BinSurface(self.bin_size, self.camera_from_bin)
+        return BinSurface(self.bin_size, self.camera_from_bin, self.walls)
 
 
 def _pack(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,6 +81,8 @@ def save_records(path: Path, records: Sequence[SceneRecord]) -> None:
     part_ids = np.concatenate([np.zeros(0, dtype=np.int32), *(r.part_ids for r in records)])
     if part_ids.any():  # what holds one part only looks as it always did
         fields["part_ids"] = part_ids
+    if walled := [astuple(r.walls) for r in records if r.walls is not None]:  # of a cycle all bins have the same walls
+        fields["walls"] = np.array(walled, dtype=np.float64)
     whole(path, lambda temporary: np.savez(temporary, **fields))  # type: ignore[arg-type]
 
 
@@ -96,6 +101,7 @@ def load_records(path: Path) -> list[SceneRecord]:
         part_ids = f.get("part_ids", np.zeros(len(f["visible_fraction"]), dtype=np.int32))
         kinds = np.split(part_ids.astype(np.int32), borders)
         cameras_from_bin = _unpack(f["camera_from_bin"])
+        walls = [Walls(*map(float, row)) for row in f["walls"]] if "walls" in f else [None] * len(f["cycle"])
         return [
             SceneRecord(
                 cycle=int(f["cycle"][i]),
@@ -108,6 +114,7 @@ def load_records(path: Path) -> list[SceneRecord]:
                 friction=float(f["friction"][i]),
                 scene_seed=int(f["scene_seed"][i]),
                 part_ids=kinds[i],
+                walls=walls[i],
             )
             for i in range(len(f["cycle"]))
         ]

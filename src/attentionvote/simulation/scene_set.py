@@ -69,6 +69,19 @@ class SceneSet:
         return [record for cycle in range(self.cycles) for record in load_records(_shard(self.directory, cycle))]
 
     @property
+    def cell_volume(self) -> tuple[float, float, float] | None:
+        """Where a bin with walls and a given distance lies: depth of its rim at the least distance that is drawn, of
+        its floor at the largest, and its longest side, metres; None where the lengths scale with D."""
+        spec = json.loads((self.directory / "manifest.json").read_text())["spec"]
+        size, distance = spec["bin"]["size"], spec["camera"]["distance"]
+        if not spec["bin"].get("walls") or size is None or distance is None:
+            return None
+        jitter = spec["camera"]["distance_jitter"]
+        # The camera looks at a point a third up the bin's axis.
+        near, far = distance * (1 - jitter) - size[2] * 2 / 3, distance * (1 + jitter) + size[2] / 3
+        return max(near, 0.01), far, max(size) * (1 + spec["bin"]["jitter"])
+
+    @property
     def cycle_of_scene(self) -> NDArray[np.int64]:
         """``(S,)`` which drop cycle each scene is of."""
         return np.array([record.cycle for record in self.records], dtype=np.int64)
@@ -166,6 +179,8 @@ def content_digest(directory: Path, cycles: int) -> str:
                 h.update(np.round(values * scale).astype("<i8").tobytes())
             if r.part_ids.any():
                 h.update(r.part_ids.astype("<i4").tobytes())
+            if r.walls is not None:
+                h.update(f"{r.walls}".encode())
     return h.hexdigest()
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
 from attentionvote.part import Parts
+from attentionvote.section import identifying
 from attentionvote.setting import Identity, Setting
 from attentionvote.simulation.camera import CameraSettings
 from attentionvote.simulation.drop_settings import BinSettings, DropSettings
@@ -121,8 +122,10 @@ class SceneSetSpec:
 
     def as_dict(self) -> dict:
         """Plain JSON values, as written into the manifest; ``keep_every`` and ``pile_share`` only where they keep less
-        than all, so that digests of before they came are the same."""
-        plain: dict = json.loads(json.dumps(asdict(self)))
+        than all, later fields of bin and drops only where they change something, so that digests of before they came
+        are the same."""
+        sections = {name: identifying(value) for name, value in vars(self).items() if is_dataclass(value)}
+        plain: dict = json.loads(json.dumps(asdict(self) | sections))
         for name in ("keep_every", "pile_share"):
             if plain[name] == 1:
                 del plain[name]

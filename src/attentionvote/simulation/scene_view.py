@@ -14,6 +14,7 @@ from attentionvote.files import whole
 from attentionvote.geometry.pose import apply
 from attentionvote.part import Parts
 from attentionvote.scene import Scene
+from attentionvote.simulation.bin_walls import bin_outlines
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
 
@@ -161,6 +162,9 @@ def _lines(name: str, segments: list[tuple[NDArray, NDArray]], colour: str) -> A
 
 
 def _bin_edges(record: SceneRecord) -> list[tuple[NDArray, NDArray]]:
+    if record.walls is not None:  # its rings: floor, opening, rim, underside
+        rings = [apply(record.camera_from_bin, ring) for ring in bin_outlines(record.bin_size, record.walls)]
+        return [(ring[i - 1], ring[i]) for ring in rings for i in range(len(ring))]
     x, y, z = record.bin_size * (0.5, 0.5, 1.0)
     corners = np.array([[sx * x, sy * y, h] for h in (0.0, z) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
     c = apply(record.camera_from_bin, corners)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from attentionvote.scene import Scene
 from attentionvote.section import check
-from attentionvote.setting import Setting
+from attentionvote.setting import Identity, Setting
 from attentionvote.simulation.ray_selection import random_order
 
 if TYPE_CHECKING:
@@ -29,8 +29,9 @@ _WORKING_DISTANCE = 0.80
 class Sensor:
     """A depth sensor.
 
-    ``baseline`` and ``edge_jump`` hold at 0.80 m and scale with the working distance. The phoxi figures follow public
-    data sheets of the Photoneo PhoXi M; they were not fitted to a real sensor.
+    The phoxi figures follow public data sheets of the Photoneo PhoXi M (other models: ``sensor_models``); they were not
+    fitted to a real sensor. ``baseline`` and ``edge_jump`` are lengths of one device where ``scaled`` is false; where
+    it is true they hold at 0.80 m and scale with the working distance, as the vendor's sizes do.
 
     Raises:
         SettingError: when a setting is out of its range.
@@ -69,6 +70,22 @@ class Sensor:
     specular: Annotated[
         float,
         Setting("phoxi: share of points lost within 5 degrees of mirror reflection into the camera.", low=0, high=1),
+    ] = 0.0
+    scaled: Annotated[
+        bool,
+        Setting(
+            "phoxi: whether baseline and edge_jump hold at 0.80 m and scale with the distance; false = as they are.",
+            identity=Identity.CHANGED,
+        ),
+    ] = True
+    noise_pixels: Annotated[
+        float,
+        Setting(
+            "phoxi: pixels over which noise is alike, as a stereo camera's matching windows make it; 0 = none.",
+            low=0,
+            high=64,
+            identity=Identity.CHANGED,
+        ),
     ] = 0.0
 
     def __post_init__(self) -> None:
@@ -140,6 +157,24 @@ def synthesize(
     )
 
 
+def alike_noise(pixels: NDArray[np.int32], spacing: float, rng: np.random.Generator) -> Floats:
+    """Standard normal noise ``(P,)`` at pixels ``(P, 2)`` (u, v) of which points nearer than ``spacing`` pixels have
+    nearly the same: values of a random grid of that spacing, interpolated, of variance 1 everywhere."""
+    if not len(pixels):
+        return np.zeros(0)
+    at = pixels / spacing
+    cell = np.floor(at).astype(np.int64)
+    cell -= cell.min(axis=0)
+    grid = rng.normal(size=cell.max(axis=0) + 2)
+    right, down = (at - np.floor(at)).T
+    noise, power = np.zeros(len(pixels)), np.zeros(len(pixels))
+    for i, across in enumerate((1 - right, right)):
+        for j, along in enumerate((1 - down, down)):
+            noise += across * along * grid[cell[:, 0] + i, cell[:, 1] + j]
+            power += (across * along) ** 2
+    return noise / np.sqrt(power)
+
+
 def _points(rays: Floats, depth: Floats) -> Floats:
     """``(P, 3)`` camera frame: where rays ``(P, 2)`` have a depth."""
     points = np.empty((len(rays), 3))
@@ -154,7 +189,10 @@ class _Scanner:
 
     def __init__(self, record: SceneRecord, caster: PartCaster, sensor: Sensor, rng: np.random.Generator) -> None:
         self.record, self.caster, self.sensor, self.rng = record, caster, sensor, rng
-        self.scale = float(record.camera_from_bin[2, 3]) / _WORKING_DISTANCE
+        nearness = float(record.camera_from_bin[2, 3]) / _WORKING_DISTANCE
+        self.scale = nearness if sensor.scaled else 1.0
+        # A point must not be shadowed by its own surface, metres.
+        self.margin = 5e-4 * nearness
         side = rng.choice([-1.0, 1.0])
         self.projector = np.array([side * sensor.baseline * self.scale, 0.0, 0.0])
         self.poses_from_projector = record.camera_from_part.copy()
@@ -171,20 +209,26 @@ class _Scanner:
         cosine, lost = self._reflection(points, hits.normal[keep])
         seen = rng.random(len(keep)) >= lost
         keep, points, cosine = keep[seen], points[seen], cosine[seen]
-        # Margin: a point must not be shadowed by its own surface.
         shadow = self.caster.blocked(
             self.poses_from_projector,
             points - self.projector,
-            5e-4 * self.scale,
+            self.margin,
             self.surface_from_projector,
             self.record.part_ids,
         )
         keep, points, cosine = keep[~shadow], points[~shadow], cosine[~shadow]
         z, lost_at_edge = self._edges(pixels[keep], points[:, 2])
         sigma = sensor.axial_sigma_mm / 1000 * (z / 0.65) ** 2 / np.maximum(cosine, 0.2)
-        noisy = z + rng.normal(size=len(z)) * sigma
+        noise = self._noise(pixels[keep])
+        noisy = z + noise * sigma
         points = points * (noisy / points[:, 2])[:, None]
         return points[~lost_at_edge], hits.instance[keep[~lost_at_edge]]
+
+    def _noise(self, pixels: NDArray[np.int32]) -> Floats:
+        """Standard normal noise of pixels ``(P, 2)``."""
+        if self.sensor.noise_pixels > 0:
+            return alike_noise(pixels, self.sensor.noise_pixels, self.rng)
+        return self.rng.normal(size=len(pixels))
 
     def _reflection(self, points: Floats, normal: Floats) -> tuple[Floats, Floats]:
         """Cosine of the incidence at the camera, and probability that the point is lost to grazing or glare."""

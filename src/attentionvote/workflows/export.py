@@ -135,7 +135,7 @@ class ExportJob:
                 "limits.scenes"
             )
         run_id, commit = (str(self.trained.get(name) or "") for name in ("run_id", "commit"))
-        card = model_card(model, metadata, self.part, *held_out.working_volume(clouds), run_id, commit)
+        card = model_card(model, metadata, self.part, *held_out.working_volume(clouds, scenes), run_id, commit)
         return ExportWork(self, model, card, scenes, settings, clouds, indices, self.cfg.limits)
 
     def finish(self, bundle: Bundle, figures: dict[str, Any]) -> dict[str, Any]:

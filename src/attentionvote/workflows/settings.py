@@ -12,7 +12,8 @@ from attentionvote.registry.gates import Rules
 from attentionvote.section import Target
 from attentionvote.setting import Setting
 from attentionvote.simulation.scene_spec import SimulationSettings
-from attentionvote.simulation.sensor import PRESETS
+from attentionvote.simulation.sensor import PRESETS, Sensor
+from attentionvote.simulation.sensor_models import CUSTOM, SENSOR_MODELS
 from attentionvote.workflows.evaluate.settings import MeasuredBundle
 
 SPLITS = ("train", "val", "test")
@@ -123,6 +124,20 @@ class ViewSettings(VerbSettings):
     max_points: Annotated[int, Setting("Most points of the cloud.", low=3, high=10_000_000)]
     root: Annotated[str, SCENE_SETS]
     output: Annotated[str, Setting("Where the pictures go.")]
+    scanner: Annotated[
+        Sensor | None, Setting("Figures of the preset that is shown, as the object's cell has them; null = its own.")
+    ] = None
+
+    @property
+    def shown_sensor(self) -> Sensor:
+        """The preset with the figures of the object's cell where that has the same one.
+
+        Raises:
+            ValueError: when the figures do not fit together.
+        """
+        if self.scanner is not None and self.scanner.preset == self.sensor:
+            return self.scanner
+        return Sensor(self.sensor, sigma_mm=self.sigma_mm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,6 +182,18 @@ class PartSettings(VerbSettings):
     title: Annotated[str, Setting("One line for people; empty: made from the name.")]
     tolerance: Annotated[
         float, Setting("How far a turned surface may be from itself for a symmetry, a share of D.", above=0, high=0.05)
+    ]
+    sensor: Annotated[
+        str | None,
+        Setting("Of the cell: a model, or custom; null = by the bin's size.", choices=(*SENSOR_MODELS, CUSTOM)),
+    ]
+    bin: Annotated[str | None, Setting("Inner length x width x height in mm; null = a usual one for the part's size.")]
+    distance: Annotated[
+        float | None,
+        Setting("From the camera to the bin, mm; null = so that the bin fills the picture.", low=50, high=100_000),
+    ]
+    camera: Annotated[
+        str | None, Setting("Of a custom sensor: a file with fx.., cam_K, K or ROS's CameraInfo; null = none.")
     ]
     force: Annotated[bool, Setting("Replace an object of the same name.")]
     parts: Annotated[str, Setting("Where the mesh in the part frame and its picture go.")]

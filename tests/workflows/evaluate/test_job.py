@@ -79,6 +79,19 @@ def test_another_peak_threshold_is_another_evaluation_and_not_the_runs_figures(r
     assert len(client.list_artifacts(training.id, "evaluation")) == 2
 
 
+def test_another_distance_is_another_set_and_not_the_runs_figures(run, export_brick, put_tables, tmp_path):
+    store = put_tables(tmp_path / "mlflow.db")
+    with start_run(store, "brick", repository=tmp_path, system_interval_s=0) as training:
+        pass
+    export_brick("model", training.id)
+    usual = run(f"tracking.store={store}")
+    near = run(f"tracking.store={store}", "simulation.camera.distance=0.35")
+    assert near["scene_set"] != usual["scene_set"]
+    client = connect(store)
+    assert client.get_run(training.id).data.tags["evaluation.set"] == usual["evaluation_set"]
+    assert len(client.list_artifacts(training.id, "evaluation")) == 2
+
+
 def test_a_run_that_is_gone_costs_a_warning_not_the_figures(run, export_brick, put_tables, tmp_path, caplog):
     export_brick("model", "feed" * 8)
     result = run(f"tracking.store={put_tables(tmp_path / 'mlflow.db')}")

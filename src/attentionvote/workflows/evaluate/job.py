@@ -65,6 +65,11 @@ class EvaluationJob:
         evaluation = self.cfg.evaluation
         return evaluation.split == "evaluation" and evaluation.dataset is None and not self.otherwise
 
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether a word places the camera elsewhere: such figures tell what a model bears, beside the run's own."""
+        return any(word.lstrip("+").startswith("simulation.camera.distance") for word in self.cfg.words)
+
     def evaluation_set(self) -> MeasuredScenes:
         """The scenes to measure on, see ``scenes_of``.
 

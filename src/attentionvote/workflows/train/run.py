@@ -15,6 +15,7 @@ from attentionvote.command.executors import executor_of
 from attentionvote.data.datamodule import PartDataModule
 from attentionvote.execution.hardware import cores
 from attentionvote.files import write_json
+from attentionvote.simulation.resolution import log_resolution
 from attentionvote.tracking.store import connect, resolve_store
 from attentionvote.training.checkpoint import usable_checkpoint
 from attentionvote.training.checkpoint_writer import AtomicCheckpoints
@@ -137,6 +138,9 @@ class TrainingRun:
         counts = self.job.scene_counts
         if self.job.dataset is not None:
             log.info("scenes of %s: %s", self.job.dataset.folder, self.job.dataset)
+        else:
+            sensor, density = self.cfg.data.sensor, self.cfg.data.density
+            log_resolution(log, self.part, self.cfg.simulation, sensor, density)
         log.info(
             "%s: %d/%d/%d scenes (train/val/test), %d points, %s parameters, %d epochs of batches of %d "
             "on %s (%s, %d thread%s%s)%s",

@@ -1,0 +1,109 @@
+"""The cell of an object in the settings of a verb: what the user leaves open is as the part's own cell has it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from attentionvote.command.errors import ConfigurationError
+from attentionvote.section import read
+from attentionvote.simulation.cell import CellSettings
+
+_WIDE = 1500  # pixels of a picture from which visibility is measured on every fourth in place of every second
+
+
+def with_cell(
+    plain: dict[str, Any], defaults: Callable[[], Mapping[str, Any]], keys: Collection[str]
+) -> dict[str, Any]:
+    """Composed settings with the values of the object's cell, which is no part of them afterwards: whatever is made of
+    them, identities and stored configurations, has its values where every user looks for them.
+
+    A word of the user's wins, and so does a choice of a group that has another value than the verb's own configuration.
+
+    Args:
+        plain: as composed; not changed.
+        defaults: gives the same of the object alone, without a word of the user's.
+        keys: dotted names of the settings that the user's words set.
+
+    Raises:
+        SettingError: on an impossible cell.
+        ConfigurationError: when the parts of a set have different cells.
+    """
+    section = plain.get("object")
+    if not isinstance(section, Mapping):
+        return plain
+    cell, rest = _taken(section)
+    plain = {**plain, "object": rest}
+    if cell is None:
+        return plain
+    values = list(_values(read(CellSettings, cell, "object.cell")))
+    before = defaults()
+    for key, value in values:
+        if key.partition(".")[0] in plain and not _is_chosen(key, plain, before, keys):
+            plain = _with(plain, key.split("."), value)
+    return plain
+
+
+def _taken(section: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, dict[str, Any]]:
+    """The cell of an object, and the object without it."""
+    rest = {name: value for name, value in section.items() if name != "cell"}
+    cell = section.get("cell")
+    members = section.get("parts")
+    if isinstance(members, Mapping):
+        cells = {str(n): member.get("cell") for n, member in members.items() if isinstance(member, Mapping)}
+        rest["parts"] = {
+            name: {k: v for k, v in member.items() if k != "cell"} if isinstance(member, Mapping) else member
+            for name, member in members.items()
+        }
+        first = next(iter(cells), None)
+        for name, other in cells.items():
+            if first is not None and cell is None and other != cells[first]:
+                raise ConfigurationError(
+                    f"the parts of a set must have one cell, but those of {first} and {name} differ: make them with "
+                    "the same SENSOR, BIN and DISTANCE, or give the set a cell of its own"
+                )
+        cell = cell if cell is not None else cells.get(first or "")
+    return cell, rest
+
+
+def _values(cell: CellSettings) -> Iterator[tuple[str, Any]]:
+    """Dotted settings of any verb with what the cell says."""
+    yield "simulation.bin.size", list(cell.bin.size)
+    yield "simulation.bin.jitter", cell.bin.jitter
+    for name, value in asdict(cell.bin.walls).items():
+        yield f"simulation.bin.walls.{name}", value
+    for name, value in asdict(cell.camera).items():
+        yield f"simulation.camera.camera.{name}", value
+    yield "simulation.camera.distance", cell.distance
+    yield "simulation.camera.distance_jitter", cell.distance_jitter
+    if cell.area is not None:
+        yield "simulation.drop.area", list(cell.area)
+    if cell.hull_threshold is not None:
+        yield "simulation.drop.hull_threshold", cell.hull_threshold
+    if cell.camera.width >= _WIDE:
+        yield "simulation.visibility_stride", 4
+    if cell.measures is None:
+        return
+    measures = asdict(cell.measures) | {"grazing_degrees": list(cell.measures.grazing_degrees)}
+    for section in ("data.sensor", "evaluation.sensor"):
+        for name, value in measures.items():
+            yield f"{section}.{name}", value
+    yield "sensor", cell.measures.preset  # of view
+    yield "scanner", measures
+
+
+def _is_chosen(key: str, plain: Any, defaults: Any, keys: Collection[str]) -> bool:
+    """Whether the user chose a setting: by a word for it or for what it lies in, or by a group."""
+    if any(key == word or key.startswith(f"{word}.") for word in keys):
+        return True
+    for name in key.split("."):
+        plain, defaults = ((at.get(name) if isinstance(at, Mapping) else None) for at in (plain, defaults))
+    return bool(plain != defaults)
+
+
+def _with(plain: Mapping[str, Any], names: list[str], value: Any) -> dict[str, Any]:
+    """A copy with a value at a place."""
+    first, *more = names
+    inner = plain.get(first)
+    return {**plain, first: _with(inner if isinstance(inner, Mapping) else {}, more, value) if more else value}
