@@ -60,7 +60,7 @@ def test_a_cell_sets_scenes_and_sensor_of_a_training() -> None:
     assert (cfg.simulation.camera.distance, cfg.simulation.camera.camera.fx) == (0.44, 2534.1)
     assert (cfg.simulation.drop.area, cfg.simulation.visibility_stride) == ((0.0302, 0.0235), 4)
     assert (cfg.data.sensor.preset, cfg.data.sensor.baseline, cfg.data.sensor.scaled) == ("phoxi", 0.23, False)
-    assert cfg.simulation.drop.hull_threshold == 0.1  # the cell says nothing of it
+    assert (cfg.simulation.drop.hull_threshold, cfg.simulation.drop.hull_volume) == (0.1, 1.2)
     assert "cell" not in cfg.composed["object"]
 
 

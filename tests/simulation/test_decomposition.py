@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import ConvexHull
 
 from attentionvote.part import Part
 from attentionvote.simulation import decomposition
-from attentionvote.simulation.decomposition import convex_hulls
+from attentionvote.simulation.decomposition import convex_hulls, volume_ratio
 
 
 def test_pieces_of_a_bracket_are_its_two_boxes(bracket: Part, hull_cache: Path) -> None:
@@ -48,6 +49,21 @@ def test_pieces_do_not_depend_on_the_size(bracket: Part, tmp_path: Path) -> None
     tiny = Part("tiny", bracket.vertices / 8, bracket.faces, bracket.diameter / 8)
     for a, b in zip(convex_hulls(bracket, cache=tmp_path), convex_hulls(tiny, cache=tmp_path), strict=True):
         np.testing.assert_allclose(a / 8, b, atol=1e-9)
+
+
+def test_a_ring_is_split_until_its_pieces_leave_the_hole_open(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    mesh = trimesh.creation.annulus(0.040, 0.050, 0.008, sections=32)
+    ring = Part("ring", np.array(mesh.vertices), np.array(mesh.faces), 0.1)
+    coarse = convex_hulls(ring, threshold=0.4, cache=tmp_path)
+    before = volume_ratio(ring, coarse)
+    assert before > 1.2
+    with caplog.at_level("INFO"):
+        fine = convex_hulls(ring, threshold=0.4, cache=tmp_path, most_volume=1.1)
+    assert volume_ratio(ring, fine) <= 1.1
+    assert len(fine) > len(coarse)
+    assert f"{before:.2f} times the part's volume, at most 1.1 are asked for" in caplog.text
+    # Nothing at the centre: another ring's rim can lie there.
+    assert min(ConvexHull(hull).equations[:, 3].max() for hull in fine) > 0.02
 
 
 @pytest.mark.parametrize(

@@ -79,8 +79,8 @@ def _values(cell: CellSettings) -> Iterator[tuple[str, Any]]:
     yield "simulation.camera.distance_jitter", cell.distance_jitter
     if cell.area is not None:
         yield "simulation.drop.area", list(cell.area)
-    if cell.hull_threshold is not None:
-        yield "simulation.drop.hull_threshold", cell.hull_threshold
+    if cell.hull_volume is not None:
+        yield "simulation.drop.hull_volume", cell.hull_volume
     if cell.camera.width >= _WIDE:
         yield "simulation.visibility_stride", 4
     if cell.measures is None:

@@ -58,9 +58,10 @@ class CellSettings:
         tuple[float, float] | None,
         Setting("Of the floor that parts fall over, length and width in metres; null = all.", above=0, high=100),
     ] = None
-    hull_threshold: Annotated[
-        float | None, Setting("Of the convex decomposition; null = as conf/simulation has it.", low=0.01, high=1)
-    ] = None
+    hull_volume: Annotated[
+        float | None,
+        Setting("Most volume of the convex pieces, a multiple of the part's; null = as it comes.", low=1.01, high=100),
+    ] = 1.2
 
     def __post_init__(self) -> None:
         check(self)

@@ -55,8 +55,8 @@ cy: {camera.cy!r}}}
 radius: {walls.radius!r}, draft_degrees: {walls.draft_degrees!r}}}
   # Length and width of the piece of the floor that parts fall over, metres, so that they make a heap; null = all of it.
   area: {area}
-  # Of the convex decomposition; null = conf/simulation says it.
-  hull_threshold: {"null" if cell.hull_threshold is None else repr(cell.hull_threshold)}
+  # Most volume of the convex pieces that fall, a multiple of the part's; null = as they come.
+  hull_volume: {"null" if cell.hull_volume is None else repr(cell.hull_volume)}
 """
 
 

@@ -77,5 +77,9 @@ def simulate_cycle(
 def solids_of(part: Parts, settings: DropSettings) -> list[Solid]:
     """The parts with their convex pieces."""
     return [
-        Solid(member, convex_hulls(member, settings.hull_threshold, settings.hull_vertices)) for member in part.parts
+        Solid(
+            member,
+            convex_hulls(member, settings.hull_threshold, settings.hull_vertices, most_volume=settings.hull_volume),
+        )
+        for member in part.parts
     ]

@@ -91,6 +91,16 @@ class DropSettings:
         float, Setting("Concavity threshold of the convex decomposition (coacd's).", low=0.01, high=1)
     ] = 0.1
     hull_vertices: Annotated[int, Setting("Most vertices of one convex piece.", low=8, high=256)] = 64
+    hull_volume: Annotated[
+        float | None,
+        Setting(
+            "Most volume of the convex pieces, a multiple of the part's: the threshold is halved until it holds; "
+            "null = as it comes.",
+            low=1.01,
+            high=100,
+            identity=Identity.CHANGED,
+        ),
+    ] = None
     speed: Annotated[float, Setting("Downward speed at release, m/s.", above=0, high=5)] = 0.5
     timeout: Annotated[float, Setting("Longest time a drop may take, seconds.", above=0.25, high=30)] = 1.5
     area: Annotated[
