@@ -234,3 +234,19 @@ def test_thresholds_that_no_farthest_vote_passes_are_refused(words: list[str], m
 def test_null_is_for_settings_that_mean_something_without_a_value(word: str) -> None:
     with pytest.raises(ConfigurationError, match=r"must be a .* got null"):
         compose(TrainSettings, ["object=gear", word])
+
+
+def test_an_object_whose_file_has_another_name_is_refused(conf: Path) -> None:
+    file = conf / "object" / "rod.yaml"
+    file.write_text(f"{{_target_: {__name__}.load, name: gear, diameter: 0.143}}")
+    expected = rf"name in {file} must be that of the file, 'rod', got 'gear': data, trainings and champion would be those of gear; correct the name, or rename the file"
+    with pytest.raises(ConfigurationError, match=expected):
+        compose(Fake, ["object=rod", "must=x"], conf)
+    assert compose(Fake, ["object=rod", "must=x", "object.name=gear"], conf).object.name == "gear"
+
+
+def test_a_file_in_another_encoding_is_named_with_its_line(conf: Path) -> None:
+    file = conf / "object" / "gear.yaml"
+    file.write_bytes(file.read_bytes() + "\n# für die Zelle\n".encode("latin-1"))
+    with pytest.raises(ConfigurationError, match=rf"must be UTF-8 text, but line 2 of {file} has the byte 0xfc: save"):
+        compose(Fake, ["object=gear", "must=x"], conf)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -13,7 +14,7 @@ from attentionvote.cad.builtin import BUILTIN_PARTS, builtin_surface
 from attentionvote.cad.mesh_file import write_surface
 from attentionvote.geometry.symmetry import Symmetry
 from attentionvote.section import Target
-from attentionvote.simulation.part_files import load_part
+from attentionvote.simulation.part_files import load_part, load_parts
 
 FROM_DATASETS = {"bunny": 0.234355236, "tless_20": 0.107, "tless_22": 0.108, "tless_29": 0.135}
 
@@ -70,3 +71,43 @@ def test_a_file_gets_the_configured_diameter_and_symmetry(tmp_path: Path) -> Non
 def test_impossible_settings_are_one_sentence(settings: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load_part("gear", "builtin:gear", **settings)
+
+
+@pytest.fixture
+def block(tmp_path: Path) -> Path:
+    mesh = trimesh.creation.box([0.1, 0.06, 0.02])
+    write_surface(np.array(mesh.vertices), np.array(mesh.faces), tmp_path / "block.ply")
+    return tmp_path / "block.ply"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"symmetry": {"kind": "cyclic", "order": 4}},
+            "symmetry must leave the surface in place, but cyclic of",
+        ),
+        ({"symmetry": {"kind": "cyclic", "order": "two"}}, "must have a whole order of at least 2, got 'two'"),
+        ({"symmetry": {"kind": "cyclic", "order": 2, "axis": "0 0 1"}}, r"as in \[0, 0, 1\]; got '0 0 1'"),
+        ({"symmetry": {"kind": "revolution", "flip": "no"}}, "symmetry flip must be true or false, got 'no'"),
+        (
+            {"diameter": 1.183},
+            "diameter must be the size of its mesh, in metres, got 1.183 .*: 0.118322 is right",
+        ),
+        ({"near_symmetric": "a half turn"}, "near_symmetric must be as `make part` writes it, got 'a half turn'"),
+        ({"mirror_image": 0.5}, "mirror_image must be as `make part` writes it, got 0.5"),
+    ],
+)
+def test_what_a_person_edits_is_checked_against_the_mesh(block: Path, settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^thing: .*{message}"):
+        load_part("thing", str(block), **settings)
+
+
+@pytest.mark.usefixtures("block")
+def test_a_set_of_one_mesh_in_two_files_is_refused(tmp_path: Path) -> None:
+    moved = trimesh.creation.box([0.1, 0.06, 0.02])
+    moved.apply_translation([0.001, 0, 0])
+    write_surface(np.array(moved.vertices), np.array(moved.faces), tmp_path / "moved.ply")
+    parts = {name: {"name": name, "mesh": str(tmp_path / f"{name}.ply")} for name in ("block", "moved")}
+    with pytest.raises(ValueError, match="two: the parts of a set must differ in shape, but block and moved are one"):
+        load_parts("two", parts)

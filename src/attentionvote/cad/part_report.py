@@ -37,12 +37,13 @@ class PartReport:
 
     @property
     def hidden_lines(self) -> list[str]:
-        """Two lines for people about the larger group, and how to choose it; none without one."""
+        """Lines for people about the larger group, and how to choose it; none without one."""
         if self.hidden is None:
             return []
         return [
             f"A sensor that cannot see {self.hidden.residual * 1e3:.3f} mm (a thread, an engraved mark) sees",
-            f'{describe(self.hidden.symmetry)}: if yours cannot, make the part again with ARGS="tolerance={UNSEEN}".',
+            f"{describe(self.hidden.symmetry)}: if yours cannot, make the part again with "
+            f'ARGS="tolerance={UNSEEN} force=true".',
         ]
 
     @property

@@ -35,8 +35,8 @@ def convex_hulls(
         max_vertices: most vertices of one piece.
         cache: cache directory, default ``files.cache_folder``.
         most_volume: of the pieces together, a multiple of the part's own; the threshold is halved until that holds,
-            down to coacd's smallest. None takes the pieces as they come. The pieces of a thin ring of 131 mm have 2.0 times
-            its volume at a threshold of 0.1: such rings never interlock.
+            down to coacd's smallest. None takes the pieces as they come. The pieces of a thin ring of 131 mm have 2.0
+            times its volume at a threshold of 0.1: such rings never interlock.
 
     Returns:
         One ``(V, 3)`` float64 array per piece, a few seconds the first time, then read from the cache.

@@ -181,7 +181,10 @@ class PartSettings(VerbSettings):
     ]
     title: Annotated[str, Setting("One line for people; empty: made from the name.")]
     tolerance: Annotated[
-        float, Setting("How far a turned surface may be from itself for a symmetry, a share of D.", above=0, high=0.05)
+        float,
+        Setting(
+            "How far a turned surface may be from itself beyond its facets' height, a share of D.", above=0, high=0.05
+        ),
     ]
     sensor: Annotated[
         str | None,
