@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 TEST_POINTS = 1_500
 SCREEN_POINTS = 240
+SETTLED = 0.01  # of the tolerance, a step of the registration after which there is nothing to gain
 ALLOWANCE = 1.05  # of a facet's height: facets of one circle are not all alike
 
 
@@ -83,8 +84,12 @@ class RotationCheck:
         return np.asarray(self.distance(turned.reshape(-1, 3)).reshape(turned.shape[:2]).mean(1))
 
     def worst(self, rotations: Array, centre: Array | float = 0.0) -> float:
-        """Largest residual of ``rotations`` ``(R, 3, 3)`` over the screening points: a lower bound of the true one."""
-        return max((self.residual(r, self.screen, centre) for r in rotations), default=0.0)
+        """Largest residual of ``rotations`` ``(R, 3, 3)`` over the screening points, a lower bound of the true one; over
+        all points where these do not tell that any fails."""
+        screened = max((self.residual(r, self.screen, centre) for r in rotations), default=0.0)
+        if screened > self.tolerance:
+            return screened
+        return max((self.residual(r, None, centre) for r in rotations), default=0.0)
 
     def holds(self, rotations: Array, centre: Array | float = 0.0) -> bool:
         """Whether every one of ``rotations`` about ``centre`` leaves the surface in place within the tolerance."""
@@ -111,10 +116,10 @@ class RotationCheck:
             lever = np.concatenate([np.cross(turned, normal), normal], axis=1)
             step = -np.linalg.solve(lever.T @ lever + damping, lever.T @ height)
             angle = float(np.linalg.norm(step[:3]))
-            if angle < 1e-9 and np.linalg.norm(step[3:]) < 1e-9 * self.radius:
-                break
             turn = rotation_about(step[:3] if angle > 0 else (0, 0, 1), min(angle, 0.1)) @ turn
             shift = shift + step[3:]
+            if angle * self.radius + np.linalg.norm(step[3:]) < SETTLED * self.tolerance:
+                break
         return turn, shift
 
     def centre(self, rotations: Array) -> Array:

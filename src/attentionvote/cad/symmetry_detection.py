@@ -51,7 +51,8 @@ class SymmetryFinding:
     ``symmetry`` is in the part frame; ``part_from_file`` ``(4, 4)`` is the identity unless ``moved``.
     ``residual`` (largest distance of a turned surface to itself over the whole group, beyond the height of its
     facets), ``facet_height`` (of the coarsest curve), ``diameter``, ``tolerance`` and ``runner_up_residual`` (of the
-    best hypothesis that was rejected: a lower bound, its axis in the file's frame) are metres.
+    best hypothesis that was rejected: a lower bound, its axis in the file's frame) are metres. ``searched``: the surface
+    moments name no axis, so that all directions were searched.
     """
 
     symmetry: Symmetry
@@ -63,6 +64,7 @@ class SymmetryFinding:
     runner_up_residual: float
     facet_height: float
     diameter: float
+    searched: bool
 
 
 def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float = TOLERANCE) -> SymmetryFinding:
@@ -103,6 +105,7 @@ def detect_symmetry(vertices: Array, faces: NDArray[np.int64], tolerance: float 
         runner_up_residual=runner_up_residual,
         facet_height=check.facet_height,
         diameter=diameter,
+        searched=detection.searched,
     )
 
 
@@ -119,6 +122,9 @@ def hidden_symmetry(vertices: Array, faces: NDArray[np.int64], finding: Symmetry
     """
     if finding.tolerance >= UNSEEN * finding.diameter:
         return None
+    # Where the axes are known, what was rejected failed by no less than the runner-up did.
+    if finding.runner_up_residual > UNSEEN * finding.diameter and not finding.searched:
+        return None
     larger = detect_symmetry(vertices, faces, UNSEEN)
     return larger if group_size(larger.symmetry) > group_size(finding.symmetry) else None
 
@@ -132,10 +138,11 @@ class _Detection:
         self.radii = np.sqrt(np.clip(values, 0, None))  # ascending
         self.axes = vectors.T
         self.rejected: list[tuple[float, str]] = []
+        self.searched = bool((np.diff(self.radii) < EQUAL_MOMENTS * self.radii[1:]).all())
 
     def group(self) -> Symmetry:
         near = np.diff(self.radii) < EQUAL_MOMENTS * self.radii[1:]
-        if near.all():
+        if self.searched:
             return self._any_direction()
         if near[0]:
             return self._single_axis(self.axes[2], self.axes[0])
