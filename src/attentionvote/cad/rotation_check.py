@@ -84,8 +84,8 @@ class RotationCheck:
         return np.asarray(self.distance(turned.reshape(-1, 3)).reshape(turned.shape[:2]).mean(1))
 
     def worst(self, rotations: Array, centre: Array | float = 0.0) -> float:
-        """Largest residual of ``rotations`` ``(R, 3, 3)`` over the screening points, a lower bound of the true one; over
-        all points where these do not tell that any fails."""
+        """Largest residual of ``rotations`` ``(R, 3, 3)`` over the screening points, a lower bound of the true one;
+        over all points where these do not tell that any fails."""
         screened = max((self.residual(r, self.screen, centre) for r in rotations), default=0.0)
         if screened > self.tolerance:
             return screened

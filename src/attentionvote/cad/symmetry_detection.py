@@ -51,8 +51,8 @@ class SymmetryFinding:
     ``symmetry`` is in the part frame; ``part_from_file`` ``(4, 4)`` is the identity unless ``moved``.
     ``residual`` (largest distance of a turned surface to itself over the whole group, beyond the height of its
     facets), ``facet_height`` (of the coarsest curve), ``diameter``, ``tolerance`` and ``runner_up_residual`` (of the
-    best hypothesis that was rejected: a lower bound, its axis in the file's frame) are metres. ``searched``: the surface
-    moments name no axis, so that all directions were searched.
+    best hypothesis that was rejected: a lower bound, its axis in the file's frame) are metres. ``searched``: the
+    surface's moments name no axis, so that all directions were searched.
     """
 
     symmetry: Symmetry
