@@ -15,7 +15,7 @@ from attentionvote.baselines.settings import FpfhSettings
 from attentionvote.part import Part
 from attentionvote.simulation.part_files import load_part
 
-QUICK = FpfhSettings(sampling=0.05, reference_step=8, iterations=2000, hypotheses=40)
+QUICK = FpfhSettings(sampling=0.05, reference_step=8, iterations=5000, hypotheses=40)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ side, and what is done about it here is the following.
 
 * Model and scene are thinned to the same voxel. The model's features are computed *as seen*: from ``views`` directions,
   each time of the points that face it only. Features of the whole surface mix both sides of a thin wall, which no
-  camera sees (connecting rod: average precision .45 with one direction, .59 with 20).
+  camera sees.
 * Every so-many-th point of the scene is a reference. The scene's points around it, in less than a part's reach, are
   matched to the model's by feature, and RANSAC answers one pose for it. Around most references nothing is found; the
   pose is then some wrong one, which the fit tells.
