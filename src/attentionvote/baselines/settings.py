@@ -59,8 +59,8 @@ class FpfhSettings:
     ``feature_radius`` of .3 gave .52, .2 .59, .15 .66, .12 .80, .1 .59; with .2, features of a single direction .45, a
     ``neighborhood`` of .5 .52, one match .51. Two scenes scatter by a tenth and more: with .12, 40 directions gave .63.
     On four (10, 14, 18 and 22 parts): voxel .04 with 3,000 iterations .56, with 10,000 .75 (12 s of a processor a
-    scene); voxel .03 with every 20th reference .77 (9 s), with 20,000 iterations as well .84 (16 s), with these and every
-    40th .75 (9 s).
+    scene); voxel .03 with every 20th reference .77 (9 s), with 20,000 iterations as well .84 (16 s), with these and
+    every 40th .75 (9 s).
 
     Raises:
         SettingError: when a setting is out of its range.
