@@ -106,7 +106,14 @@ def test_an_object_without_a_mesh_is_left_out_unless_it_is_asked_for(tmp_path: P
 
 
 def test_words_of_trainings_and_of_scenes_are_told_apart() -> None:
-    words = ["experiment=compact", "table=table_6", "evaluation.cycles=2", "trainer.max_epochs=12", "rows=ours"]
+    words = [
+        "experiment=compact",
+        "table=table_6",
+        "evaluation.cycles=2",
+        "trainer.max_epochs=12",
+        "rows=ours",
+        "fpfh.sampling=0.1",
+    ]
     assert benchmark.training_words(words, True) == ["experiment=compact", "trainer.max_epochs=12"]
     assert benchmark.training_words(["force=true", "seed=1"], False) == ["force=true", "seed=1", "force=false"]
     assert benchmark.scene_words(words) == ["evaluation=benchmark", "evaluation.cycles=2"]
