@@ -1,4 +1,4 @@
-"""OpenCV's surface matching as it is: what the baseline's docstring says of it, and the thinning of clouds."""
+"""OpenCV's surface matching as it is: what the baseline's docstring says of it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from attentionvote.baselines.opencv import surface_matching, thinned, threads
+from attentionvote.baselines.clouds import thinned
+from attentionvote.baselines.opencv import surface_matching, threads
 from attentionvote.part import Part
 
 
@@ -47,17 +48,6 @@ def test_its_distance_step_is_not_read(cloud: np.ndarray) -> None:
     one, other = matched(cloud, 1000.0), matched(cloud, 1000.0, distance_step=0.5)
     assert [pose.numVotes for pose in one] == [pose.numVotes for pose in other]
     np.testing.assert_array_equal(one[0].pose, other[0].pose)
-
-
-def test_thinning_keeps_one_point_a_voxel_and_the_two_sides_of_a_wall_apart() -> None:
-    rng = np.random.default_rng(3)
-    place = rng.uniform(0, 0.1, (4000, 2))
-    wall = [np.c_[place, np.full(4000, z), np.tile([0, 0, sign], (4000, 1))] for z, sign in ((0.0, -1), (0.001, 1))]
-    thin = thinned(np.concatenate(wall).astype(np.float32), 0.01)
-    assert len(thin) == 200  # 10 x 10 voxels of 10 mm, two sides
-    np.testing.assert_allclose(thin[:, 5] * (thin[:, 2] - 0.0005), 0.0005, atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(thin[:, 3:], axis=1), 1, atol=1e-6)
-    assert np.ptp(thin[:, 0]) == pytest.approx(0.09, abs=0.004)
 
 
 def test_threads_are_put_back_after_a_failure() -> None:

@@ -8,16 +8,13 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from standing_parts import errors, seen, standing
 
 from attentionvote.baselines.opencv import surface_matching
 from attentionvote.baselines.ppf import PpfDetector
 from attentionvote.baselines.settings import PpfSettings
-from attentionvote.geometry.pointcloud import estimate_normals
-from attentionvote.geometry.pose import rotation_about, transform
 from attentionvote.part import Part
-from attentionvote.simulation.camera import Camera
 from attentionvote.simulation.part_files import load_part
-from attentionvote.simulation.raycast import PartCaster
 
 COARSE = {"sampling": 0.08, "reference_step": 3, "hypotheses": 30}
 
@@ -40,38 +37,6 @@ def refined(voted: PpfDetector) -> PpfDetector:
     detector = copy.copy(voted)
     detector.settings = PpfSettings(**COARSE, score="fit")
     return detector
-
-
-def standing(part: Part, count: int) -> np.ndarray:
-    """Poses of ``count`` parts before the camera, a diameter and a half apart, each turned another way."""
-    turns = [
-        rotation_about(axis, angle) for axis, angle in (([1, 0.4, 0], 2.0), ([0, 1, 0.7], -2.2), ([1, -1, 1], 1.2))
-    ]
-    places = [[1.5 * part.diameter * (i - (count - 1) / 2), 0.01 * i, 0.9] for i in range(count)]
-    return transform(np.stack(turns[:count]), np.array(places))
-
-
-def seen(part: Part, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points as a camera sees them, with 0.2 mm of noise, and their normals."""
-    rng = np.random.default_rng(4)
-    camera = Camera(400, 300, 500.0, 500.0, 200.0, 150.0)
-    pixels = np.stack(np.meshgrid(np.arange(400), np.arange(300)), axis=-1).reshape(-1, 2)
-    rays = camera.rays(rng.permutation(pixels))
-    hits = PartCaster(part).cast(poses, rays, None, background=False)
-    hit = hits.instance >= 0
-    points = np.c_[rays[hit], np.ones(hit.sum())] * hits.depth[hit, None] + rng.normal(scale=2e-4, size=(hit.sum(), 3))
-    points = points.astype(np.float32)
-    return points, estimate_normals(points)
-
-
-def errors(part: Part, found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of every true pose, distance of the centre as a share of D and degrees up to symmetry, to the nearest found."""
-    center = (part.vertices.min(axis=0) + part.vertices.max(axis=0)) / 2
-    at = [poses[:, :3, :3] @ center + poses[:, :3, 3] for poses in (found, true)]
-    table = np.linalg.norm(at[0][:, None] - at[1], axis=-1) / part.diameter
-    nearest = table.argmin(axis=0)
-    angles = part.symmetry.angle(found[nearest, :3, :3], true[:, :3, :3])
-    return table.min(axis=0), np.degrees(angles)
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -25,17 +25,18 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from attentionvote.baselines.clouds import Detections, checked, surface, thinned
 from attentionvote.baselines.hypotheses import apart, fits, merged, placed
-from attentionvote.baselines.opencv import surface_matching, thinned, threads
+from attentionvote.baselines.opencv import surface_matching, threads
 from attentionvote.baselines.settings import PpfSettings
 from attentionvote.geometry.pose import transform
-from attentionvote.part import Part, uniform_points
+from attentionvote.part import Part
 
 Array = NDArray[np.float64]
 _MODEL_POINTS, _FIT_POINTS = 30_000, 1_500
@@ -43,13 +44,6 @@ _LEAST_POINTS = 30  # fewer determine no pose
 _MOST_CELLS = 200  # along an edge of OpenCV's grid: 200 MB
 _UNITS_PER_DIAMETER = 1000.0  # OpenCV merges poses within ``sampling`` of a unit: nothing
 _ICP_TOLERANCE, _ICP_REJECTION, _ICP_LEVELS = 0.005, 2.5, 4  # OpenCV's defaults, fewer levels for few points
-
-
-class Detections(NamedTuple):
-    """Poses ``(R, 4, 4)`` camera from part, metres, and scores ``(R,)``, best first."""
-
-    camera_from_part: Array
-    scores: Array
 
 
 class PpfDetector:
@@ -72,8 +66,8 @@ class PpfDetector:
         self._reach = float(np.linalg.norm(part.vertices - self._center, axis=1).max())
         self._unit = _UNITS_PER_DIAMETER / part.diameter
         rng = np.random.default_rng(0)
-        self._model = _surface(part, _FIT_POINTS, rng)
-        model = thinned(_surface(part, _MODEL_POINTS, rng), self.settings.sampling * part.diameter)
+        self._model = surface(part, _FIT_POINTS, rng)
+        model = thinned(surface(part, _MODEL_POINTS, rng), self.settings.sampling * part.diameter)
         self.model_points = len(model)
         # The second argument is not read by OpenCV; the third is the number of angles.
         step = self.settings.sampling
@@ -90,7 +84,7 @@ class PpfDetector:
         Raises:
             ValueError: when normals are missing, shapes disagree or a number is not finite.
         """
-        cloud = _checked(points, normals)
+        cloud = checked(points, normals, "point pair features")
         if len(cloud) < _LEAST_POINTS:
             return Detections(np.zeros((0, 4, 4)), np.zeros(0))
         settings, diameter = self.settings, self.part.diameter
@@ -113,7 +107,7 @@ class PpfDetector:
     def votes(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> tuple[Array, Array]:
         """What OpenCV's ``match`` answers: a pose ``(R, 4, 4)`` in metres and its votes ``(R,)`` a reference point."""
         voxel = self.settings.sampling * self.part.diameter
-        scene = thinned(_checked(points, normals), voxel)
+        scene = thinned(checked(points, normals, "point pair features"), voxel)
         extent = np.ptp(scene[:, :3], axis=0)
         if len(scene) < _LEAST_POINTS or extent.max() <= 0:
             return np.zeros((0, 4, 4)), np.zeros(0)
@@ -153,34 +147,6 @@ class PpfDetector:
         scaled = np.ascontiguousarray(cloud, dtype=np.float32).copy()
         scaled[:, :3] *= np.float32(self._unit)
         return scaled
-
-
-def _surface(part: Part, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Points uniform on the surface and outward normals ``(count, 6)``, part frame, metres."""
-    points, faces = uniform_points(part.vertices[part.faces], count, rng)
-    a, b, c = (part.vertices[part.faces[faces, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
-    return np.concatenate([points, cross / np.linalg.norm(cross, axis=1, keepdims=True)], axis=1).astype(np.float32)
-
-
-def _checked(points: NDArray[np.floating], normals: NDArray[np.floating] | None) -> NDArray[np.float32]:
-    """Points and normals side by side ``(P, 6)``."""
-    if normals is None:
-        raise ValueError(
-            "point pair features need a normal at every point, got none: estimate them with "
-            "geometry.pointcloud.estimate_normals"
-        )
-    points, normals = np.asarray(points), np.asarray(normals)
-    if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
-        raise ValueError(f"points and normals must both have shape (P, 3), got {points.shape} and {normals.shape}")
-    cloud = np.concatenate([points, normals], axis=1).astype(np.float32)
-    if not np.isfinite(cloud).all():
-        bad = int((~np.isfinite(cloud)).any(axis=1).sum())
-        raise ValueError(f"points and normals must be finite, got {bad} points with NaN or inf")
-    length = np.linalg.norm(cloud[:, 3:], axis=1)
-    if len(cloud) and not np.abs(length - 1).max() < 0.1:
-        raise ValueError(f"normals must be unit vectors, got lengths {length.min():.3g}..{length.max():.3g}")
-    return cloud
 
 
 def _rigid(poses: Array) -> Array:

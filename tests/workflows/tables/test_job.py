@@ -28,7 +28,13 @@ from attentionvote.workflows.train.settings import TrainSettings
 ROOT = Path(__file__).resolve().parents[3]
 # Two cycles of a scene with a few bricks.
 FEW = ["evaluation.cycles=2", "evaluation.density=2000", "evaluate=['simulation=smoke','simulation.drop_counts=[2,3]']"]
-COARSE = ["baseline_workers=1", "ppf.sampling=0.15"]
+COARSE = [
+    "baseline_workers=1",
+    "ppf.sampling=0.15",
+    "fpfh.sampling=0.1",
+    "+fpfh.feature_radius=0.3",
+    "+fpfh.iterations=200",
+]
 PLACES = ["outputs=outputs/train", "root=data", "tracking.store=mlflow.db", "page=page.md"]
 
 
@@ -57,16 +63,19 @@ def test_ours_and_the_baseline_are_measured_on_the_same_scenes(export_brick: Any
     bundle = load_bundle((tmp_path / "outputs" / "benchmark" / "export" / "brick" / "latest").resolve(), None)
     ExportJob.find(compose(ExportSettings, exported)).finish(bundle, {})
     smoke = ["experiment=smoke", "force=false", "export=['scenes=32']"]
-    done = run(tmp_path, "table=table_5", "objects=brick", *smoke, "rows='ours,VoteNet-style,PPF'", *COARSE)
+    done = run(
+        tmp_path, "table=table_5", "objects=brick", *smoke, "rows='ours,VoteNet-style,PPF,FPFH and ICP'", *COARSE
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    ours, ppf = result["cells"]
-    assert [(cell["row"], cell["object"]) for cell in (ours, ppf)] == [("ours", "brick"), ("PPF", "brick")]
-    assert ours["evaluation_set"] == ppf["evaluation_set"]
+    ours, ppf, fpfh = result["cells"]
+    rows = [("ours", "brick"), ("PPF", "brick"), ("FPFH and ICP", "brick")]
+    assert [(cell["row"], cell["object"]) for cell in (ours, ppf, fpfh)] == rows
+    assert ours["evaluation_set"] == ppf["evaluation_set"] == fpfh["evaluation_set"]
     assert ours["bundle"] == bundle.digest
     assert (ours["seed"], ours["commit"], ours["budget"]["steps"]) == (0, "c" * 40, 8)
-    assert ppf["budget"] is None
-    for cell in (ours, ppf):
+    assert ppf["budget"] is fpfh["budget"] is None
+    for cell in (ours, ppf, fpfh):
         assert cell["scenes"] == 2
         assert cell["figures"]["latency_p50_ms"] > 0
         assert len(cell["thresholds"]) == len(cell["ap_by_threshold"]) == 21
@@ -97,7 +106,14 @@ def test_an_object_without_a_mesh_is_left_out_unless_it_is_asked_for(tmp_path: P
 
 
 def test_words_of_trainings_and_of_scenes_are_told_apart() -> None:
-    words = ["experiment=compact", "table=table_6", "evaluation.cycles=2", "trainer.max_epochs=12", "rows=ours"]
+    words = [
+        "experiment=compact",
+        "table=table_6",
+        "evaluation.cycles=2",
+        "trainer.max_epochs=12",
+        "rows=ours",
+        "fpfh.sampling=0.1",
+    ]
     assert benchmark.training_words(words, True) == ["experiment=compact", "trainer.max_epochs=12"]
     assert benchmark.training_words(["force=true", "seed=1"], False) == ["force=true", "seed=1", "force=false"]
     assert benchmark.scene_words(words) == ["evaluation=benchmark", "evaluation.cycles=2"]

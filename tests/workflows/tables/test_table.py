@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,9 +10,11 @@ import yaml
 
 from attentionvote.command.conf_folder import CONF, choices
 from attentionvote.command.configuration import compose
+from attentionvote.measurement.baseline_scenes import VARIANTS
 from attentionvote.workflows.evaluate.settings import EvaluateSettings
 from attentionvote.workflows.settings import ExportSettings
-from attentionvote.workflows.tables.table import BenchmarkTable, mean, title_of
+from attentionvote.workflows.tables.settings import TablesSettings
+from attentionvote.workflows.tables.table import DETECTORS, BenchmarkTable, mean, title_of
 from attentionvote.workflows.train.settings import TrainSettings
 
 NAMES = sorted(path.stem for path in (CONF / "table").glob("*.yaml"))
@@ -80,6 +83,21 @@ def test_table_5_repeats_table_3_with_a_digit_more() -> None:
         assert all(abs(rough[name] - value) < 0.02 for name, value in fine.items())
 
 
+@pytest.mark.parametrize("name", ["table_3", "table_5", "table_6"])
+def test_both_classical_baselines_stand_beside_ours(name: str) -> None:
+    detectors = [row.detector for row in BenchmarkTable.of(name, content(name)).measured]
+    assert detectors[-3:] == ["ppf", "ppf_icp_fit", "fpfh_icp"]
+
+
+def test_every_detector_has_a_variant_and_the_section_of_its_settings() -> None:
+    assert set(DETECTORS) == {"network", *VARIANTS}
+    cfg = compose(TablesSettings, ["table=table_5", "+fpfh.iterations=3000"])
+    for name, variant in VARIANTS.items():
+        settings = replace(variant, **cfg.composed[DETECTORS[name]])
+        assert type(settings) is type(getattr(cfg, DETECTORS[name]))
+    assert settings.iterations == 3000
+
+
 def test_a_row_with_a_value_too_many_is_refused(small: dict[str, Any]) -> None:
     small["paper"][0]["values"].append(0.1)
     with pytest.raises(ValueError, match="T: theirs must have 2 values of one of ap_10, ap_2, got 3 of ap_10"):
@@ -87,7 +105,9 @@ def test_a_row_with_a_value_too_many_is_refused(small: dict[str, Any]) -> None:
 
 
 def test_an_unknown_detector_and_a_name_twice_are_refused(small: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="detector must be one of network, ppf, ppf_icp, ppf_icp_fit, got 'icp'"):
+    with pytest.raises(
+        ValueError, match="detector must be one of network, ppf, ppf_icp, ppf_icp_fit, fpfh_icp, got 'icp'"
+    ):
         BenchmarkTable.of("T", {**small, "measured": [{"name": "PPF", "detector": "icp"}]})
     with pytest.raises(ValueError, match="a row's name must have no comma, rows= is a list of them; got 'a, b'"):
         BenchmarkTable.of("T", {**small, "measured": [{"name": "a, b"}]})

@@ -1,14 +1,11 @@
-"""What stands in one cell of a benchmark's table: a trained, exported, evaluated model, or the classical baseline."""
+"""What stands in one cell of a benchmark's table: a trained, exported, evaluated model, or a classical baseline."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
-from importlib.metadata import version as package_version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,9 +95,9 @@ def _cell_of_part(cell: Mapping[str, Any], part: str) -> dict[str, Any]:
 
 
 def baseline_cell(
-    evaluate: Sequence[str], name: str, row: Row, folder: Path, workers: int, ppf: Mapping[str, Any]
+    evaluate: Sequence[str], name: str, row: Row, folder: Path, workers: int, changed: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The cell of the classical baseline on the scenes that the models are measured on.
+    """The cell of a classical baseline on the scenes that the models are measured on.
 
     Its working point is chosen on a cycle of validation scenes, as a model's is.
 
@@ -110,13 +107,13 @@ def baseline_cell(
         row: of the table.
         folder: keeps what is measured.
         workers: processes; the time of a scene is of one.
-        ppf: settings of ``PpfSettings``.
+        changed: settings of the detector other than those of its variant.
 
     Raises:
-        ValueError: when OpenCV is missing, or the scenes cannot be had.
+        ValueError: when the baseline's library is missing, or the scenes cannot be had.
     """
 
-    from attentionvote.measurement.baseline_scenes import VARIANTS, ppf_results
+    from attentionvote.measurement.baseline_scenes import VARIANTS, baseline_results, identity
     from attentionvote.measurement.figures import figures_of, machine
     from attentionvote.measurement.models import Measurement
     from attentionvote.tracking.provenance import git_state
@@ -125,11 +122,9 @@ def baseline_cell(
 
     cfg = compose(EvaluateSettings, [f"object={name}", *evaluate])
     part: Part = cfg.object()
-    settings = replace(VARIANTS[row.detector], **ppf)
+    settings = replace(VARIANTS[row.detector], **changed)
     frozen = scenes_of(cfg, part)
-    what = [asdict(settings), frozen.digest, part.digest, package_version("opencv-contrib-python-headless")]
-    key = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-    path = folder / row.detector / f"{name}-{key[:12]}.json"
+    path = folder / row.detector / f"{name}-{identity(settings, frozen.digest, part)[:12]}.json"
     stored = read_json(path)
     if stored is not None and not cfg.force:
         return stored | {"frozen": is_recorded(cfg, part, frozen)}
@@ -139,7 +134,7 @@ def baseline_cell(
     for scenes in (validation, frozen):
         clouds = list(_shown(scenes.clouds(), f"{name}: clouds", len(scenes)))
         bar = partial(_shown, title=f"{row.name}, {name}", total=len(clouds))
-        measured_sets.append(ppf_results(part, clouds, settings, workers, shown=bar))
+        measured_sets.append(baseline_results(part, clouds, settings, workers, shown=bar))
     (validation_results, _), (results, seconds) = measured_sets
     measured = Measurement(
         row.detector, results, frozen.cycle_of_scene, best_threshold(validation_results, part), seconds

@@ -97,6 +97,7 @@ def run(cfg: TablesSettings, words: Sequence[str]) -> dict[str, Any]:
 def _measure(cfg: TablesSettings, words: Sequence[str], row: Row, name: str) -> dict[str, Any] | None:
     from attentionvote.execution.hardware import cores
     from attentionvote.workflows.tables.cells import baseline_cell, network_cell
+    from attentionvote.workflows.tables.table import DETECTORS
 
     folder = Path(cfg.benchmarks)
     part = words_of(("object",), words)
@@ -111,7 +112,7 @@ def _measure(cfg: TablesSettings, words: Sequence[str], row: Row, name: str) -> 
         return network_cell(verbs, name, cfg.train)
     # Where bundles lie and who signed them is nothing to the baseline.
     on = [f"root={cfg.root}", *here.evaluate, *(["force=true"] if cfg.force else [])]
-    return baseline_cell(on, name, row, folder, cfg.baseline_workers or cores(), cfg.composed["ppf"])
+    return baseline_cell(on, name, row, folder, cfg.baseline_workers or cores(), cfg.composed[DETECTORS[row.detector]])
 
 
 def record(cfg: TablesSettings, objects: Sequence[str]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
-from attentionvote.baselines.settings import PpfSettings
+from attentionvote.baselines.settings import FpfhSettings, PpfSettings
 from attentionvote.command.sections import EvaluationSettings
 from attentionvote.setting import Setting
 from attentionvote.workflows.train.settings import TrainSettings
@@ -36,9 +36,10 @@ class TablesSettings(TrainSettings):
     export: Annotated[tuple[str, ...], Setting("Words for the exports.", empty=True)]
     evaluate: Annotated[tuple[str, ...], Setting("Words for the evaluations.", empty=True)]
     baseline_workers: Annotated[
-        int | None, Setting("Processes of the classical baseline; null = one per core.", low=1, high=1024)
+        int | None, Setting("Processes of the classical baselines; null = one per core.", low=1, high=1024)
     ]
     ppf: PpfSettings
+    fpfh: FpfhSettings
     benchmarks: Annotated[str, Setting("Where models and evaluations lie.")]
     page: Annotated[str, Setting("Page whose tables are written; page='' = none.")]
     record: Annotated[bool, Setting("Record the digests of the frozen scenes instead of measuring.")]

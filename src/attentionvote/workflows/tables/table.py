@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 VERBS = ("train", "export", "evaluate")
-DETECTORS = ("network", "ppf", "ppf_icp", "ppf_icp_fit")
+# And the section of conf/benchmark.yaml that says how each searches; the network's settings are those of its training.
+DETECTORS = {"network": "", "ppf": "ppf", "ppf_icp": "ppf", "ppf_icp_fit": "ppf", "fpfh_icp": "fpfh"}
 _KINDS = {"ap": "AP", "add_precision": "ADD precision", "add_recall": "ADD recall"}
 
 
@@ -17,8 +18,8 @@ class Row:
 
     Args:
         name: shown; a row of the paper with this name belongs to it.
-        detector: ``network``, ``ppf`` (point pair features), ``ppf_icp`` (with its registration) or ``ppf_icp_fit``
-            (and ranked by how well the pose fits).
+        detector: ``network``, ``ppf`` (point pair features), ``ppf_icp`` (with its registration), ``ppf_icp_fit``
+            (and ranked by how well the pose fits) or ``fpfh_icp`` (fast point feature histograms, RANSAC and ICP).
         train, export, evaluate: further words of the verbs.
         together: set of parts that is measured in place of each object by itself: one network, all parts in one bin.
             The figures of its parts are the row's.
