@@ -81,6 +81,21 @@ def test_a_missing_compiler_is_named_with_its_package(checkout: Path) -> None:
     assert "a C compiler with headers (cc) is missing; install it (Debian: gcc libc6-dev)" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("library", "sentence"),
+    [
+        ("libstdc++", "the library libstdc++.so.6 is missing; install it (Debian: libstdc++6)"),
+        ("libusb", "the library libusb-1.0.so.0, which Open3D loads, is missing; install it (Debian: libusb-1.0-0)"),
+    ],
+)
+def test_a_missing_library_is_named_with_its_package(checkout: Path, library: str, sentence: str) -> None:
+    program(checkout / "bin", "cc", "exit 0")
+    python = program(checkout / "bin", "python3.11", f'case "$*" in *{library}*) exit 1 ;; *) exit 0 ;; esac')
+    done = make(checkout, "setup", f"PYTHON={python}", first_on_path=checkout / "bin")
+    assert done.returncode != 0
+    assert sentence in done.stderr
+
+
 def test_a_failed_installation_leaves_no_stamp_and_says_so(checkout: Path) -> None:
     program(checkout / "bin", "cc", "exit 0")
     python = program(checkout / "bin", "python3.11", "exit 0")
@@ -120,4 +135,10 @@ def test_words_reach_the_verb(checkout: Path) -> None:
     done = make(checkout, "--dry-run", "part", "NAME=bracket", "MESH=my meshes/b.stl", "UNITS=mm", "BODY=2")
     assert " ".join(done.stdout.replace("\\", " ").split()).endswith(
         """pipelines/part.py name=bracket "mesh='my meshes/b.stl'" units=mm body=2"""
+    )
+    done = make(
+        checkout, "--dry-run", "part", "NAME=b", "MESH=b.step", "SENSOR=phoxi_m", "BIN=360x280x160", "DISTANCE=800"
+    )
+    assert " ".join(done.stdout.replace("\\", " ").split()).endswith(
+        "sensor=phoxi_m \"bin='360x280x160'\" distance=800"
     )
