@@ -39,13 +39,13 @@ def shards(directory: Path) -> dict[str, bytes]:
 
 @pytest.fixture(autouse=True)
 def quick_hulls(box: Part, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cycle, "convex_hulls", lambda *_: (box.vertices[ConvexHull(box.vertices).vertices],))
+    monkeypatch.setattr(cycle, "convex_hulls", lambda *_, **__: (box.vertices[ConvexHull(box.vertices).vertices],))
 
 
 @pytest.fixture(scope="session")
 def one_process(box: Part, tmp_path_factory: pytest.TempPathFactory) -> SceneSet:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cycle, "convex_hulls", lambda *_: (box.vertices[ConvexHull(box.vertices).vertices],))
+        patch.setattr(cycle, "convex_hulls", lambda *_, **__: (box.vertices[ConvexHull(box.vertices).vertices],))
         return generate_scene_set(box, spec_of(box), tmp_path_factory.mktemp("one"), progress=False)
 
 

@@ -47,7 +47,7 @@ def root(part: Part, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with the train and test scenes of a brick."""
     folder = tmp_path_factory.mktemp("data")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cycle, "convex_hulls", lambda p, *_: (p.vertices[ConvexHull(p.vertices).vertices],))
+        patch.setattr(cycle, "convex_hulls", lambda p, *_, **__: (p.vertices[ConvexHull(p.vertices).vertices],))
         for spec in scene_set_specs(part, read(SimulationSettings, SETTINGS)).values():
             directory = scene_set_directory(folder / "scenes", part.name, spec)
             generate_scene_set(part, spec, directory, progress=False)

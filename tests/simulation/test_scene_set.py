@@ -35,7 +35,7 @@ COARSE = DropSettings(timestep=0.008, contact_time=0.02)
 @pytest.fixture(autouse=True)
 def known_hulls(hulls: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bracket's two boxes; coacd has its own tests."""
-    monkeypatch.setattr(cycle, "convex_hulls", lambda *_: hulls)
+    monkeypatch.setattr(cycle, "convex_hulls", lambda *_, **__: hulls)
 
 
 def make_spec(part: Part, **changes: object) -> SceneSetSpec:
@@ -223,7 +223,7 @@ from pathlib import Path
 from attentionvote.simulation import cycle, scene_set
 if __name__ == "__main__":
     part, hulls, spec, directory = pickle.loads(Path(sys.argv[1]).read_bytes())
-    cycle.convex_hulls = lambda *_: hulls
+    cycle.convex_hulls = lambda *_, **__: hulls
     scene_set.generate_scene_set(part, spec, directory, workers=2)
 """
 

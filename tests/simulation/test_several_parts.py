@@ -31,7 +31,7 @@ CAMERA = Camera(160, 120, 250.0, 250.0, 80.0, 60.0)
 
 @pytest.fixture(autouse=True)
 def one_hull(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cycle, "convex_hulls", lambda part, *_: (part.vertices,))
+    monkeypatch.setattr(cycle, "convex_hulls", lambda part, *_, **__: (part.vertices,))
 
 
 @pytest.fixture
