@@ -147,3 +147,29 @@ def test_verbs_without_scenes_do_not_mind() -> None:
     cfg = compose(settings_of("history"), ["object=washer"])
     assert isinstance(cfg.object, Target)  # type: ignore[attr-defined]
     assert cfg.object().name == "washer"  # type: ignore[attr-defined]
+
+
+def test_half_a_camera_or_sensor_of_a_group_is_not_mixed_with_the_cells(tmp_path: Path) -> None:
+    # Width, height and centre are as the project's default has them: the whole camera is the user's all the same.
+    camera = "{width: 1032, height: 772, fx: 1200.0, fy: 1200.0, cx: 516.0, cy: 386.0}"
+    for group, text in (
+        ("simulation", f"defaults: [default]\ncamera: {{camera: {camera}}}\n"),
+        ("data", "defaults: [compact]\nsensor: {preset: gaussian, sigma_mm: 0.8}\n"),
+    ):
+        (tmp_path / group).mkdir()
+        (tmp_path / group / "mine.yaml").write_text(text)
+    cfg = train("simulation=mine", "data=mine")
+    seen = cfg.simulation.camera.camera
+    assert (seen.width, seen.height, seen.fx, seen.cx) == (1032, 772, 1200.0, 516.0)
+    assert (cfg.data.sensor.preset, cfg.data.sensor.sigma_mm) == ("gaussian", 0.8)
+    assert cfg.simulation.camera.distance == 0.44  # of which the group says nothing
+    assert train("data.sensor.baseline=0.3").data.sensor.preset == "phoxi"  # a word is for itself alone
+
+
+def test_parts_of_a_set_may_differ_in_the_area_of_their_heaps(tmp_path: Path) -> None:
+    file = tmp_path / "object" / "nut.yaml"
+    file.write_text(file.read_text().replace("area: [0.0302, 0.0235]", "area: [0.05, 0.02]"))
+    cfg = compose(TrainSettings, ["object=same"])
+    assert (cfg.simulation.camera.distance, cfg.simulation.drop.area) == (0.44, (0.05, 0.0235))
+    file.write_text(file.read_text().replace("area: [0.05, 0.02]", "area: null"))
+    assert compose(TrainSettings, ["object=same"]).simulation.drop.area is None

@@ -73,3 +73,18 @@ def test_what_is_no_camera_is_one_sentence(tmp_path: Path, content: object, mess
 def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"camera file '.*none\.json' does not exist"):
         read_camera(tmp_path / "none.json")
+
+
+def test_the_projection_matrix_of_a_rectified_picture_counts(tmp_path: Path) -> None:
+    # As `ros2 topic echo` prints a message, with the distortion that K is of, and an end of document.
+    path = tmp_path / "info.yaml"
+    path.write_text(
+        "width: 640\nheight: 480\nd: [0.1, 0, 0, 0, 0]\nk: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
+        "p: [520, 0, 318, 0, 0, 521, 238, 0, 0, 0, 1, 0]\n---\n"
+    )
+    assert read_camera(path) == Camera(640, 480, 520, 521, 318, 238)
+    path.write_text(path.read_text().replace("520, 0, 318, 0, 0, 521, 238", "0, 0, 0, 0, 0, 0, 0"))
+    assert read_camera(path) == Camera(640, 480, 600, 600, 320, 240)
+    path.write_text("binning_x: 2\n" + path.read_text())
+    with pytest.raises(ValueError, match="must be of the whole picture, got binning_x 2"):
+        read_camera(path)

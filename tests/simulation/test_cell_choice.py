@@ -130,3 +130,25 @@ def test_bins_in_millimetres() -> None:
         assert asdict(walls_for(tuple(side / 1000 for side in size)))["thickness"] == walls.thickness  # type: ignore[arg-type]
     assert walls_for((0.01, 0.01, 0.01)).problem(np.array([0.01, 0.01, 0.01])) == ""
     assert fitting_distance(Camera(), (0.36, 0.28, 0.16), Walls()) > 0.6
+
+
+def test_a_low_bin_gets_more_floor_or_is_refused() -> None:
+    block = trimesh.creation.box([0.04, 0.02, 0.01])
+    part = Part("block", np.array(block.vertices), np.array(block.faces), 0.0458)
+    high, low = (choose_cell(part, 30, bin_text=f"600x400x{height}") for height in (160, 20))
+    assert high.area is not None
+    # The same heap in a lower bin covers as much more floor, as far as there is any.
+    wider = np.prod(low.area or low.bin.size[:2]) / np.prod(high.area)
+    assert wider == pytest.approx(0.05124 / 0.02, rel=0.02)  # the protocol's bin of this part is 51 mm high
+    cube = trimesh.creation.box([0.06, 0.06, 0.06])
+    with pytest.raises(ValueError, match="high enough for parts that lie on each other, at least 90 mm, got 80"):
+        choose_cell(Part("cube", np.array(cube.vertices), np.array(cube.faces), 0.104), 30, bin_text="600x400x80")
+
+
+def test_a_principal_point_beside_the_middle_needs_more_distance() -> None:
+    size, walls = (0.36, 0.28, 0.16), Walls()
+    middle = fitting_distance(Camera(640, 480, 600, 600, 319.5, 239.5), size, walls)
+    beside = fitting_distance(Camera(640, 480, 600, 600, 479.5, 239.5), size, walls)
+    half = walls.outer_size(np.array(size))[0] / 2
+    assert beside == pytest.approx(half * 600 / 160 * 1.05 + 0.16 * 2 / 3, rel=1e-3)
+    assert beside > 1.5 * middle

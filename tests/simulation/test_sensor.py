@@ -16,7 +16,7 @@ from attentionvote.part import Part
 from attentionvote.scene import Scene
 from attentionvote.simulation.raycast import PartCaster
 from attentionvote.simulation.scene_record import SceneRecord
-from attentionvote.simulation.sensor import Sensor, alike_noise, synthesize
+from attentionvote.simulation.sensor import CorrelatedNoise, Sensor, synthesize
 
 Records = Callable[..., SceneRecord]
 ALL = 10**6
@@ -199,9 +199,10 @@ def test_lengths_of_a_device_do_not_scale_with_the_distance(caster: PartCaster, 
 
 
 @given(st.floats(1.5, 20), st.integers(0, 100))
-def test_alike_noise_has_variance_one_and_fades_over_its_pixels(spacing: float, seed: int) -> None:
-    pixels = np.stack(np.meshgrid(np.arange(-20, 180), np.arange(150)), axis=2).reshape(-1, 2).astype(np.int32)
-    noise = alike_noise(pixels, spacing, np.random.default_rng(seed)).reshape(150, 200)
+def test_correlated_noise_has_variance_one_and_fades_over_its_length(spacing: float, seed: int) -> None:
+    pixels = np.stack(np.meshgrid(np.arange(200), np.arange(150)), axis=2).reshape(-1, 2).astype(np.int32)
+    picture = CorrelatedNoise(200, 150, spacing, np.random.default_rng(seed))
+    noise = picture(pixels).reshape(150, 200)
     cells = 150 * 200 / spacing**2
     assert abs(noise.var() - 1) < 6 / np.sqrt(cells)
     beside = (noise[:, 1:] * noise[:, :-1]).mean() / noise.var()
@@ -209,10 +210,10 @@ def test_alike_noise_has_variance_one_and_fades_over_its_pixels(spacing: float, 
     away = (noise[:, far:] * noise[:, :-far]).mean() / noise.var()
     assert beside > 1 - 1.2 / spacing
     assert abs(away) < 6 / np.sqrt(cells)
-    # Any order of the pixels, any few of them.
+    # Any order of the pixels, any few of them: a scene is measured in batches.
     some = np.random.default_rng(0).permutation(len(pixels))[:500]
-    assert alike_noise(pixels[some], spacing, np.random.default_rng(seed)).shape == (500,)
-    assert alike_noise(pixels[:0], spacing, np.random.default_rng(seed)).shape == (0,)
+    np.testing.assert_array_equal(picture(pixels[some]), noise.ravel()[some])
+    assert picture(pixels[:0]).shape == (0,)
 
 
 def test_noise_of_a_stereo_camera_is_alike_beside(caster: PartCaster, scene_record: Records) -> None:

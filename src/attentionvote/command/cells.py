@@ -10,6 +10,8 @@ from attentionvote.command.errors import ConfigurationError
 from attentionvote.section import read
 from attentionvote.simulation.cell import CellSettings
 
+# Sections of which all is the user's when a group of theirs says something else of any of it.
+_BLOCKS = ("simulation.bin.walls", "simulation.camera.camera", "data.sensor", "evaluation.sensor")
 _WIDE = 1500  # pixels of a picture from which visibility is measured on every fourth in place of every second
 
 
@@ -19,7 +21,8 @@ def with_cell(
     """Composed settings with the values of the object's cell, which is no part of them afterwards: whatever is made of
     them, identities and stored configurations, has its values where every user looks for them.
 
-    A word of the user's wins, and so does a choice of a group that has another value than the verb's own configuration.
+    A word of the user's wins. So does a choice of a group that says anything else of a camera, a sensor or walls than
+    the verb's own configuration: a whole one of these, since half a camera of the user's and half a cell's is none.
 
     Args:
         plain: as composed; not changed.
@@ -38,9 +41,11 @@ def with_cell(
     if cell is None:
         return plain
     values = list(_values(read(CellSettings, cell, "object.cell")))
-    before = defaults()
+    before, composed = defaults(), plain
     for key, value in values:
-        if key.partition(".")[0] in plain and not _is_chosen(key, plain, before, keys):
+        block = next((block for block in _BLOCKS if key.startswith(f"{block}.")), key)
+        is_worded = any(key == word or key.startswith(f"{word}.") for word in keys)
+        if key.partition(".")[0] in plain and not is_worded and not _is_from_a_group(block, composed, before, keys):
             plain = _with(plain, key.split("."), value)
     return plain
 
@@ -58,13 +63,21 @@ def _taken(section: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, dict[s
         }
         first = next(iter(cells), None)
         for name, other in cells.items():
-            if first is not None and cell is None and other != cells[first]:
+            if first is not None and cell is None and _without_area(other) != _without_area(cells[first]):
                 raise ConfigurationError(
                     f"the parts of a set must have one cell, but those of {first} and {name} differ: make them with "
                     "the same SENSOR, BIN and DISTANCE, or give the set a cell of its own"
                 )
-        cell = cell if cell is not None else cells.get(first or "")
+        if cell is None and (cell := cells.get(first or "")) is not None:
+            # The area follows the size of each part's heap: the largest holds them all, none is the whole floor.
+            areas = [other["area"] for other in cells.values() if other.get("area") is not None]
+            whole = len(areas) < len(cells)
+            cell = {**cell, "area": None if whole else [max(side) for side in zip(*areas, strict=True)]}
     return cell, rest
+
+
+def _without_area(cell: Any) -> Any:
+    return {name: value for name, value in cell.items() if name != "area"} if isinstance(cell, Mapping) else cell
 
 
 def _values(cell: CellSettings) -> Iterator[tuple[str, Any]]:
@@ -93,13 +106,25 @@ def _values(cell: CellSettings) -> Iterator[tuple[str, Any]]:
     yield "scanner", measures
 
 
-def _is_chosen(key: str, plain: Any, defaults: Any, keys: Collection[str]) -> bool:
-    """Whether the user chose a setting: by a word for it or for what it lies in, or by a group."""
-    if any(key == word or key.startswith(f"{word}.") for word in keys):
-        return True
-    for name in key.split("."):
+def _is_from_a_group(block: str, plain: Any, defaults: Any, keys: Collection[str]) -> bool:
+    """Whether a group that the user chose says something else of a setting or a section than the verb's defaults; what
+    words say is left aside."""
+    for name in block.split("."):
         plain, defaults = ((at.get(name) if isinstance(at, Mapping) else None) for at in (plain, defaults))
-    return bool(plain != defaults)
+    ours, theirs = dict(_leaves(defaults, block)), dict(_leaves(plain, block))
+    return any(
+        ours.get(key) != theirs.get(key)
+        for key in ours.keys() | theirs.keys()
+        if not any(key == word or key.startswith(f"{word}.") for word in keys)
+    )
+
+
+def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(node, Mapping):
+        for name, value in node.items():
+            yield from _leaves(value, f"{key}.{name}")
+    else:
+        yield key, node
 
 
 def _with(plain: Mapping[str, Any], names: list[str], value: Any) -> dict[str, Any]:

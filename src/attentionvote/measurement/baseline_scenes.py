@@ -67,11 +67,12 @@ class BaselineTask:
         detector = self._detector
         start = time.perf_counter()
         normals = scene.normals
-        if normals is None and len(scene.points) >= 3:
-            normals = estimate_normals(scene.points)
-        return detector.detect(scene.points, np.zeros_like(scene.points) if normals is None else normals), (
-            time.perf_counter() - start
-        )
+        points = scene.points
+        if normals is None and len(points) < 3:  # nothing to estimate normals from, and no pose either
+            points = normals = points[:0]
+        elif normals is None:
+            normals = estimate_normals(points)
+        return detector.detect(points, normals), (time.perf_counter() - start)
 
     def __getstate__(self) -> dict[str, object]:
         return {name: value for name, value in self.__dict__.items() if name != "_detector"}

@@ -18,7 +18,8 @@ _SIZES = (("width", "image_width"), ("height", "image_height"))
 def read_camera(path: Path) -> Camera:
     """The pinhole camera that a JSON or YAML file describes; of a file by image (BOP's scene_camera.json) the first.
 
-    Distortion is not looked at: depth images are rectified.
+    Distortion is not looked at: depth images are rectified, and their intrinsics are those of the projection matrix
+    ``P`` (``p``) where a ROS CameraInfo has one.
 
     Raises:
         ValueError: with one sentence, when the file describes none.
@@ -27,7 +28,8 @@ def read_camera(path: Path) -> Camera:
     if not path.is_file():
         raise FileNotFoundError(f"camera file {str(path)!r} does not exist")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))  # JSON is YAML
+        # JSON is YAML; `ros2 topic echo` ends a message with ---, and may print several.
+        content = next(yaml.safe_load_all(path.read_text(encoding="utf-8")), None)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} must be JSON or YAML, but it cannot be read") from error
     if isinstance(content, Mapping) and isinstance(content.get("camera"), Mapping):  # a cell's file
@@ -36,7 +38,12 @@ def read_camera(path: Path) -> Camera:
         content = next(iter(content.values()))
     if not isinstance(content, Mapping):
         raise ValueError(f"{path} must have fx, fy, cx, cy or a matrix {', '.join(_MATRICES)}, got no names at all")
-    focal = _focal_lengths(path, content)
+    for name in ("binning_x", "binning_y"):
+        if content.get(name) not in (None, 0, 1):
+            raise ValueError(
+                f"{path} must be of the whole picture, got {name} {content[name]!r}: give fx, fy, cx, cy as binned"
+            )
+    focal = _focal_lengths(path, _rectified(content))
     size = [next((content[name] for name in names if name in content), None) for names in _SIZES]
     for (name, _), value, middle in zip(_SIZES, size, focal[2:], strict=True):
         if isinstance(value, bool) or not isinstance(value, int):
@@ -47,6 +54,20 @@ def read_camera(path: Path) -> Camera:
         return Camera(width, height, fx, fy, cx, cy)  # type: ignore[arg-type]  # whole numbers, as checked
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _rectified(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """With the matrix ``K`` of the projection matrix, where one is given that is not empty."""
+    for name in ("P", "p", "projection_matrix"):
+        values = content.get(name)
+        values = values.get("data") if isinstance(values, Mapping) else values
+        try:
+            matrix = np.array(values, dtype=np.float64).ravel()
+        except (TypeError, ValueError):
+            continue
+        if matrix.shape == (12,) and matrix[0] > 0:
+            return {"K": matrix.reshape(3, 4)[:, :3].ravel().tolist()}
+    return content
 
 
 def _focal_lengths(path: Path, content: Mapping[str, Any]) -> tuple[float, float, float, float]:

@@ -83,5 +83,7 @@ class CellSettings:
 def fitting_distance(camera: Camera, size: tuple[float, float, float], walls: Walls) -> float:
     """The least distance (to a point a third up the bin's axis, metres) at which the picture holds the bin's rim, with
     a twentieth to spare. The bin's length lies along the picture's width."""
-    half_picture = np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2
+    # The nearer side of the picture decides where the principal point is not in its middle.
+    across = min(camera.cx, camera.width - 1 - camera.cx) + 0.5, min(camera.cy, camera.height - 1 - camera.cy) + 0.5
+    half_picture = np.array(across) / (camera.fx, camera.fy)
     return float((walls.outer_size(np.array(size)) / 2 / half_picture).max() * 1.05 + size[2] * 2 / 3)

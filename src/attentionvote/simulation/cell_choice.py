@@ -90,7 +90,10 @@ def default_bin(parts: Parts, count: int) -> Size:
 def drop_area(parts: Parts, size: Size, count: int) -> tuple[float, float] | None:
     """The piece of a bin's floor over which ``count`` parts make a heap as in the benchmark's protocol, metres; None
     where that is the whole floor. A thin layer of parts teaches nothing of piles, and hundreds of parts are dear."""
-    heap = np.minimum(_protocol_bin(parts, count)[:2], size[:2])
+    protocol = _protocol_bin(parts, count)
+    # In a lower bin the same heap needs more floor: the cycle ends at the rim.
+    lower = max(1.0, float(protocol[2]) / size[2])
+    heap = np.minimum(protocol[:2] * np.sqrt(lower), size[:2])
     if (heap >= _ROOM * np.array(size[:2])).all():
         return None
     length, width = heap.round(4)
@@ -155,6 +158,13 @@ def _protocol_bin(parts: Parts, count: int) -> np.ndarray:
 def _check_room(parts: Parts, size: Size) -> None:
     """Refuse a bin of which a part is longer than the diagonal, or that the fewest parts of a pile fill."""
     needed = _protocol_bin(parts, _LEAST_PARTS)
+    # A part's centre must stay below the rim when it lies on another.
+    low = 1.5 * float(np.ptp(parts.parts[0].box, axis=0).min())
+    if size[2] < low:
+        raise ValueError(
+            f"bin must be high enough for parts that lie on each other, at least {np.ceil(low * 1000):.0f} mm, got "
+            f"{size[2] * 1000:g}: take a higher one"
+        )
     if np.prod(size) < np.prod(needed) * (_LEAST_PARTS / 30) or np.linalg.norm(size) < parts.diameter:
         length, width, height = np.ceil(needed * 100) * 10
         given = "x".join(f"{side * 1000:g}" for side in size)

@@ -140,7 +140,13 @@ def generate_scene_set(
             for cycle, records in run_cycles(part, solids, spec, missing, workers, progress, title, done, executor):
                 save_records(_shard(directory, cycle), records)
             _write_manifest(directory, part, spec, content_digest(directory, spec.cycles))
-    return SceneSet.open(directory)
+    scenes = SceneSet.open(directory)
+    if len(scenes.records) < spec.scenes / 2:
+        log.warning(
+            "%s, %s scenes: %d of %d piles came of it, because the bin was full before; a higher or wider bin has room",
+            part.name, spec.split, len(scenes.records), spec.scenes,
+        )  # fmt: skip
+    return scenes
 
 
 def _is_complete(directory: Path, spec: SceneSetSpec) -> bool:

@@ -157,22 +157,26 @@ def synthesize(
     )
 
 
-def alike_noise(pixels: NDArray[np.int32], spacing: float, rng: np.random.Generator) -> Floats:
-    """Standard normal noise ``(P,)`` at pixels ``(P, 2)`` (u, v) of which points nearer than ``spacing`` pixels have
-    nearly the same: values of a random grid of that spacing, interpolated, of variance 1 everywhere."""
-    if not len(pixels):
-        return np.zeros(0)
-    at = pixels / spacing
-    cell = np.floor(at).astype(np.int64)
-    cell -= cell.min(axis=0)
-    grid = rng.normal(size=cell.max(axis=0) + 2)
-    right, down = (at - np.floor(at)).T
-    noise, power = np.zeros(len(pixels)), np.zeros(len(pixels))
-    for i, across in enumerate((1 - right, right)):
-        for j, along in enumerate((1 - down, down)):
-            noise += across * along * grid[cell[:, 0] + i, cell[:, 1] + j]
-            power += (across * along) ** 2
-    return noise / np.sqrt(power)
+class CorrelatedNoise:
+    """Standard normal noise of a picture whose neighbouring pixels have nearly the same: values of a random grid,
+    interpolated, of variance 1 everywhere."""
+
+    def __init__(self, width: int, height: int, length: float, rng: np.random.Generator) -> None:
+        """``length``: spacing of the grid in pixels, over which the noise is correlated."""
+        self._length = length
+        self._grid = rng.normal(size=(int(width / length) + 2, int(height / length) + 2))
+
+    def __call__(self, pixels: NDArray[np.int32]) -> Floats:
+        """Noise ``(P,)`` at pixels ``(P, 2)`` (u, v) within the picture."""
+        at = pixels / self._length
+        cell = np.floor(at).astype(np.int64)
+        right, down = (at - cell).T
+        noise, power = np.zeros(len(pixels)), np.zeros(len(pixels))
+        for i, across in enumerate((1 - right, right)):
+            for j, along in enumerate((1 - down, down)):
+                noise += across * along * self._grid[cell[:, 0] + i, cell[:, 1] + j]
+                power += (across * along) ** 2
+        return noise / np.sqrt(power)
 
 
 def _points(rays: Floats, depth: Floats) -> Floats:
@@ -193,6 +197,12 @@ class _Scanner:
         self.scale = nearness if sensor.scaled else 1.0
         # A point must not be shadowed by its own surface, metres.
         self.margin = 5e-4 * nearness
+        # One grid a scene: pixels are measured in several batches.
+        self._correlated = (
+            CorrelatedNoise(record.camera.width, record.camera.height, sensor.noise_pixels, rng)
+            if sensor.noise_pixels > 0
+            else None
+        )
         side = rng.choice([-1.0, 1.0])
         self.projector = np.array([side * sensor.baseline * self.scale, 0.0, 0.0])
         self.poses_from_projector = record.camera_from_part.copy()
@@ -226,8 +236,8 @@ class _Scanner:
 
     def _noise(self, pixels: NDArray[np.int32]) -> Floats:
         """Standard normal noise of pixels ``(P, 2)``."""
-        if self.sensor.noise_pixels > 0:
-            return alike_noise(pixels, self.sensor.noise_pixels, self.rng)
+        if self._correlated is not None:
+            return self._correlated(pixels)
         return self.rng.normal(size=len(pixels))
 
     def _reflection(self, points: Floats, normal: Floats) -> tuple[Floats, Floats]:
