@@ -88,3 +88,24 @@ def test_how_far_from_flat_the_rim_is_bounds_what_is_invented() -> None:
         assert (result.holes == 1) == is_closed
         if is_closed:
             assert 0.1 * lift < result.uncertainty <= 0.5 * lift
+
+
+def test_the_ends_of_a_bore_whose_wall_is_missing_are_not_closed() -> None:
+    plate = trimesh.boolean.difference([box([10, 6, 1]), cylinder(0.3, 4, sections=24)])
+    radius = np.linalg.norm(plate.triangles_center[:, :2], axis=1)
+    is_wall = (np.abs(plate.face_normals[:, 2]) < 0.5) & (radius < 0.4)
+    assert is_wall.sum() == 48
+    result, _ = lids_of(plate, is_wall)
+    assert (result.holes, len(result.refused)) == (0, 48)
+
+
+def test_a_missing_ring_is_not_closed_by_two_discs() -> None:
+    # The floor of a counterbore: the through bore would become blind under a membrane.
+    bores = [cylinder(0.3, 4, sections=24), cylinder(0.45, 1, sections=24)]
+    bores[1].apply_translation([0, 0, 0.7])
+    plate = trimesh.boolean.difference([box([10, 6, 1]), *bores])
+    heights = plate.triangles_center[:, 2]
+    is_floor = (np.abs(plate.face_normals[:, 2]) > 0.9) & (np.abs(heights - 0.2) < 0.01)
+    assert is_floor.any()
+    result, _ = lids_of(plate, is_floor)
+    assert (result.holes, len(result.refused)) == (0, 48)

@@ -250,3 +250,44 @@ def test_a_part_turned_is_the_same_part() -> None:
     for _ in range(3):
         pose = transform(matrix_from_quaternion(random_quaternion(rng)), rng.normal(size=3))
         assert describe(detect_symmetry(apply(pose, vertices), faces).symmetry) == "cyclic of order 2 about (0 0 1)"
+
+
+def stadium(facets: int) -> trimesh.Trimesh:
+    """100 x 40 x 20 mm, half circles of facets at both ends, two flat sides."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, facets // 2 + 1)
+    half = 0.02 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    outline = np.concatenate([half + np.array([0.03, 0]), -half - np.array([0.03, 0])])
+    rings = [np.column_stack([outline, np.full(len(outline), z)]) for z in (-0.01, 0.01)]
+    return trimesh.convex.convex_hull(np.concatenate(rings))
+
+
+@pytest.mark.parametrize(("facets", "depth"), [(16, 0.001), (24, 0.0003)])
+def test_a_groove_in_a_plane_between_fillets_is_seen(facets: int, depth: float) -> None:
+    # The plane ends in curves, but is none: what lies in it is measured to the tolerance.
+    groove = trimesh.creation.box(bounds=[[0.014, 0.02 - depth, -0.004], [0.026, 0.03, 0.004]])
+    part = trimesh.boolean.difference([stadium(facets), groove])
+    assert detect_symmetry(np.array(part.vertices), part.faces).symmetry == Symmetry()
+    whole = stadium(facets)
+    found = detect_symmetry(np.array(whole.vertices), whole.faces).symmetry
+    assert (found.kind, found.order) == ("dihedral", 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hub", "kind"), [(False, "dihedral"), (True, "cyclic")])
+def test_a_compact_gear_of_17_teeth_keeps_them(hub: bool, kind: str) -> None:
+    # Its three principal moments are nearly equal, and no small order tells of the teeth.
+    angle = np.arange(68) * 2 * np.pi / 68
+    radius = np.where(np.arange(68) % 4 < 2, 0.011, 0.009)
+    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    length = 0.0185 if hub else 0.01925
+    rings = [np.column_stack([rim, np.full(68, z)]) for z in (0.0, length)]
+    i, j = np.arange(68), (np.arange(68) + 1) % 68
+    sides = [np.stack([i, j, j + 68], 1), np.stack([i, j + 68, i + 68], 1)]
+    ends = [np.stack([np.full(68, 136), j, i], 1), np.stack([np.full(68, 137), i + 68, j + 68], 1)]
+    gear = trimesh.Trimesh(np.concatenate([*rings, [[0, 0, 0], [0, 0, length]]]), np.concatenate(sides + ends))
+    if hub:
+        boss = trimesh.creation.cylinder(0.006, 0.004, sections=48)
+        boss.apply_translation([0, 0, length])
+        gear = trimesh.boolean.union([gear, boss])
+    found = detect_symmetry(np.array(gear.vertices), gear.faces).symmetry
+    assert (found.kind, found.order) == (kind, 17)

@@ -17,6 +17,7 @@ Ints = NDArray[np.int64]
 
 LARGEST_MOVE = 5e-4  # of the diameter: how far the surface may lie from the file's
 SMALL = 0.1  # a hole this narrow is closed whatever is around it; a wider one if its lid goes on as its surroundings do
+SLIT = 0.2  # width over length of a round from which it may be the end of a tube
 GOES_ON = np.cos(np.radians(10.0))
 EXACT_CORNERS = 40  # the best lid is searched for up to this many corners
 
@@ -45,10 +46,12 @@ def lids(vertices: Array, faces: Ints, mate: Ints) -> Lids:
     made: list[Ints] = []
     refused: list[Ints] = []
     uncertainty = 0.0
-    for loop in _loops(faces, mate):
+    loops = _loops(faces, mate)
+    ends = _ends_of_tubes(vertices, faces, loops)
+    for number, loop in enumerate(loops):
         corners = faces.ravel()[loop]
         rim = np.stack([corners, np.roll(corners, -1)], axis=1)
-        lid, off = _lid(vertices, faces, loop, known)
+        lid, off = (None, 0.0) if number in ends else _lid(vertices, faces, loop, known)
         if lid is None:
             refused.append(rim)
             continue
@@ -89,6 +92,31 @@ def _loops(faces: Ints, mate: Ints) -> list[list[int]]:
         if path:
             loops.append(path)
     return [loop for loop in loops if len(loop) > 2]
+
+
+def _ends_of_tubes(vertices: Array, faces: Ints, loops: list[list[int]]) -> set[int]:
+    """Rounds that face another one of the same outline, the two ends of a bore or tube whose wall is missing, and those
+    within another one in its plane, where a ring is missing: a lid would close what was meant to be open."""
+    start_of = faces.ravel()
+    shapes = []
+    for number, loop in enumerate(loops):
+        points = vertices[start_of[loop]]
+        middle = points.mean(axis=0)
+        spread = np.linalg.svd(points - middle, full_matrices=False)
+        widths = np.ptp((points - middle) @ spread.Vh[:2].T, axis=0)
+        if len(loop) > 4 and widths.min() > SLIT * widths.max():
+            shapes.append((number, middle, spread.Vh[2], float(widths.max())))
+    found = set()
+    for i, (a, middle, normal, width) in enumerate(shapes):
+        for b, other, other_normal, other_width in shapes[:i]:
+            between = other - middle
+            along = float(between @ normal)
+            beside = float(np.linalg.norm(between - along * normal))
+            is_coaxial = abs(normal @ other_normal) > GOES_ON and beside < 0.1 * min(width, other_width)
+            is_alike = abs(width - other_width) < 0.05 * max(width, other_width)
+            if is_coaxial and (is_alike or abs(along) < 0.05 * min(width, other_width)):
+                found |= {a, b}
+    return found
 
 
 def _after(half_edge: int) -> int:

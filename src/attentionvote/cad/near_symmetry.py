@@ -28,7 +28,7 @@ class Twin(NamedTuple):
         rotation: ``(3, 3)`` in the part frame, about the part's origin up to ``translation`` ``(3,)`` metres.
         translation: metres.
         overlap: share of the surface that lies within ``ALIKE`` of the diameter of itself.
-        largest: largest distance of a point of the turned surface to the surface, metres.
+        largest: largest distance of a point of the turned surface to the surface, metres, beyond the height of facets.
     """
 
     rotation: Array
@@ -111,7 +111,8 @@ def _same(symmetry: Symmetry, a: Array, b: Array) -> bool:
 
 def _twin(check: RotationCheck, rotation: Array, translation: Array, diameter: float) -> Twin:
     distance = check.distances(rotation, translation)
-    return Twin(rotation, translation, float((distance < ALIKE * diameter).mean()), float(distance.max()))
+    overlap = float((distance < ALIKE * diameter).mean())
+    return Twin(rotation, translation, overlap, check.excess(rotation, translation))
 
 
 def _registered_between(moving: RotationCheck, still: RotationCheck, rotation: Array) -> tuple[Array, Array]:

@@ -60,7 +60,7 @@ class ImportedPart(NamedTuple):
     @property
     def line(self) -> str:
         """Which file, what was done to it, and how far that moved the surface."""
-        moved = f"; the surface moved by {self.moved * 1e6:.2g} um at most" if self.moved else ""
+        moved = f"; the surface moved by {self.moved * 1e6:.2g} um at most" if self.moved >= 1e-9 else ""
         return f"{self.source}: {self.report}{moved}"
 
 

@@ -88,7 +88,7 @@ class PartReport:
     @property
     def is_mirror_symmetric(self) -> bool:
         """Whether the mirror image is the part itself."""
-        return self.mirror["largest"] <= SAME_HAND * self.finding.diameter + 2 * self.finding.facet_height
+        return self.mirror["largest"] <= SAME_HAND * self.finding.diameter
 
 
 def examine(vertices: Array, faces: NDArray[np.int64], tolerance: float) -> PartReport:

@@ -76,6 +76,15 @@ class RotationCheck:
         """Distances ``(P,)`` in metres of the turned and moved test points to the surface."""
         return self.distance(self.points @ rotation.T + translation)
 
+    def excess(self, rotation: Array, translation: Array) -> float:
+        """Largest distance in metres of the turned, or mirrored, and moved test points to the surface, beyond the
+        heights of the facets that meet."""
+        turned = self.points @ rotation.T + translation
+        distance = self.distance(turned)
+        if self._curves:
+            distance = distance - np.maximum(self._allowance(self.points), self._allowance(turned))
+        return max(0.0, float(distance.max()))
+
     def means(self, rotations: Array, most: int = 96) -> Array:
         """Mean distances ``(R,)`` in metres of some screening points under ``rotations`` ``(R, 3, 3)``: what searches
         minimise."""

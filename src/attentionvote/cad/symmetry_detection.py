@@ -232,6 +232,20 @@ class _Detection:
     def _any_direction(self) -> Symmetry:
         """Three equal principal moments: a regular polyhedron's group, or an accident of proportions."""
         axes = search_axes(self.check)
+        found = self._of_axes(axes)
+        if found.is_revolution or found.kind == "group":
+            return found
+        # Only small orders were searched: a gear of 17 teeth as wide as high shows its half turns, or nothing.
+        turned_over = [u for u, n in axes if n == 2][:2]
+        across = [np.cross(turned_over[0], turned_over[1])] if len(turned_over) == 2 else []
+        for axis in [*across, *self.axes]:
+            unit = axis / np.linalg.norm(axis)
+            other = self._single_axis(unit, np.asarray(Symmetry("none", axis_of(unit)).perpendicular))
+            found = max(found, other, key=group_size)
+        return found
+
+    def _of_axes(self, axes: list[tuple[Array, int]]) -> Symmetry:
+        """The group that the axes and prime orders found make, or that they are part of."""
         revolutions: list[Array] = []
         for u, _ in axes:
             is_new = all(abs(u @ v) < np.cos(0.1) for v in revolutions)

@@ -17,7 +17,7 @@ FLAT = np.radians(0.05)  # two triangles that turn less are one facet
 SMOOTH = np.radians(22.5) + 1e-3
 # A small bore is often tessellated coarser: of 9 facets and more it is a circle, where no sensor sees the difference.
 COARSE, UNSEEN = np.radians(41.0), 0.002  # turn at an edge; height, a share of the surface's size
-UNEVEN = 3.0  # a facet counts as at most so many times as wide as the next: a plane beside a fillet is no facet
+UNEVEN = 3.0  # what is more times as wide as the facet beside it is a plane beside a fillet, and flat
 ROUND = 8 / 3  # a triangle inscribed in a sphere lies so much deeper than the strip of a cylinder of the same turns
 MOST_CORNERS = 64  # of a facet; larger ones are planes
 
@@ -55,8 +55,7 @@ def facet_heights(vertices: Array, faces: Index) -> Array:
     first, second, turn, edges = (x[is_curve] for x in (first, second, turn, edges))
     corners = _Corners.of(facet, faces)
     widths = np.stack([_widths(vertices, edges, corners, f) for f in (first, second)], axis=1)
-    limited = np.minimum(widths, UNEVEN * widths[:, ::-1])
-    limited = np.where(np.isfinite(limited), limited, 0.0)
+    limited = np.where(np.isfinite(widths) & (widths <= UNEVEN * widths[:, ::-1]), widths, 0.0)
     heights = np.zeros(facet.max() + 1)
     total = limited.sum(1)
     limit = np.where(turn <= SMOOTH, np.inf, UNSEEN * float(np.linalg.norm(np.ptp(vertices[faces], axis=(0, 1)))))

@@ -68,11 +68,12 @@ def _taken(section: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, dict[s
                     f"the parts of a set must have one cell, but those of {first} and {name} differ: make them with "
                     "the same SENSOR, BIN and DISTANCE, or give the set a cell of its own"
                 )
-        if cell is None and (cell := cells.get(first or "")) is not None:
+        one = cells.get(first or "")
+        if cell is None and one is not None:
             # The area follows the size of each part's heap: the largest holds them all, none is the whole floor.
-            areas = [other["area"] for other in cells.values() if other.get("area") is not None]
+            areas = [other["area"] for other in cells.values() if other and other.get("area") is not None]
             whole = len(areas) < len(cells)
-            cell = {**cell, "area": None if whole else [max(side) for side in zip(*areas, strict=True)]}
+            cell = {**one, "area": None if whole else [max(side) for side in zip(*areas, strict=True)]}
     return cell, rest
 
 

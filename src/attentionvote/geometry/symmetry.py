@@ -18,6 +18,7 @@ from attentionvote.geometry.pose import matrix_from_quaternion, rotation_about, 
 
 Kind = Literal["none", "cyclic", "dihedral", "group", "revolution"]
 Axis = tuple[float, float, float]
+LARGEST_ORDER = 3600  # of a body that is not one of revolution; more is a slip of the pen
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,22 @@ class Symmetry:
             unit = value / np.linalg.norm(value)
             object.__setattr__(self, name, (float(unit[0]), float(unit[1]), float(unit[2])))
         is_number = isinstance(self.order, (int, float)) and not isinstance(self.order, bool)
-        if not is_number or (self.kind in ("cyclic", "dihedral") and (self.order < 2 or self.order != int(self.order))):
+        is_whole = is_number and np.isfinite(self.order) and self.order == int(self.order)
+        if not is_whole or (self.kind in ("cyclic", "dihedral") and self.order < 2):
             raise ValueError(f"{self.kind} symmetry must have a whole order of at least 2, got {self.order!r}")
+        if self.order > LARGEST_ORDER:
+            raise ValueError(f"symmetry order must be at most {LARGEST_ORDER}, got {self.order!r}: is it a revolution?")
         if not isinstance(self.flip, bool):
             raise ValueError(f"symmetry flip must be true or false, got {self.flip!r}")
         if self.kind == "dihedral" and abs(np.dot(self.axis, self.flip_axis)) > 1e-6:
             raise ValueError(f"flip_axis must be perpendicular to axis, got {self.flip_axis} and {self.axis}")
-        object.__setattr__(self, "quaternions", tuple(tuple(float(v) for v in q) for q in self.quaternions))
+        try:
+            object.__setattr__(self, "quaternions", tuple(tuple(float(v) for v in q) for q in self.quaternions))
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                "a group must list its elements as quaternions of four numbers (w, x, y, z), "
+                f"got {self.quaternions!r:.80}"
+            ) from error
         if self.kind == "group":
             self._check_group()
 
