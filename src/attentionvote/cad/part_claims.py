@@ -22,6 +22,7 @@ CONTRADICTION = 0.05  # of D, that a claimed symmetry may carry the surface off 
 SAME_SHAPE = 0.003  # of D: two surfaces this near are one to any sensor
 LARGEST_RATIO = 8.0  # of the diameters in one bin: lengths of the network are shares of the largest
 SURFACE_POINTS, TEST_POINTS = 40_000, 300
+MOST_ROTATIONS = 400  # that are tried of a large group
 
 
 def check_claims(part: Part) -> None:
@@ -81,7 +82,9 @@ def _carried_off(part: Part) -> float:
     surface = cKDTree(np.concatenate([part.surface_points(SURFACE_POINTS, rng), part.vertices]))
     corners = part.vertices[np.unique(part.faces)]
     points = np.concatenate([part.surface_points(TEST_POINTS, rng), rng.permutation(corners)[:TEST_POINTS]])
-    turned = np.einsum("rij,pj->rpi", tested_rotations(part.symmetry), points)
+    rotations = tested_rotations(part.symmetry)
+    rotations = rotations[:: max(1, len(rotations) // MOST_ROTATIONS)]
+    turned = np.einsum("rij,pj->rpi", rotations, points)
     return float(surface.query(turned.reshape(-1, 3))[0].max())
 
 

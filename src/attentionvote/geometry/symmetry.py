@@ -18,7 +18,7 @@ from attentionvote.geometry.pose import matrix_from_quaternion, rotation_about, 
 
 Kind = Literal["none", "cyclic", "dihedral", "group", "revolution"]
 Axis = tuple[float, float, float]
-LARGEST_ORDER = 3600  # of a body that is not one of revolution; more is a slip of the pen
+LARGEST_ORDER = 10_000  # of a body that is not one of revolution; more is a slip of the pen
 
 
 @dataclass(frozen=True)
