@@ -75,7 +75,7 @@ def mirror_image(vertices: Array, faces: NDArray[np.int64], diameter: float) -> 
     mirrored = RotationCheck((vertices - centroid) @ reflection, faces[:, ::-1], check.tolerance)
     best: Twin | None = None
     for start in _turns(axes):
-        turn, shift = _registered_between(mirrored, check, start)
+        turn, shift = check.registered(start, points=mirrored.screen)
         twin = _twin(check, turn @ reflection, shift, diameter)
         if best is None or (twin.overlap, -twin.largest) > (best.overlap, -best.largest):
             best = twin
@@ -113,8 +113,3 @@ def _twin(check: RotationCheck, rotation: Array, translation: Array, diameter: f
     distance = check.distances(rotation, translation)
     overlap = float((distance < ALIKE * diameter).mean())
     return Twin(rotation, translation, overlap, check.excess(rotation, translation))
-
-
-def _registered_between(moving: RotationCheck, still: RotationCheck, rotation: Array) -> tuple[Array, Array]:
-    """As ``RotationCheck.registered``, of one surface to another."""
-    return still.registered(rotation, points=moving.screen)

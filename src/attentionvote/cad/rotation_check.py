@@ -53,24 +53,14 @@ class RotationCheck:
         the heights of the facets that meet."""
         p = (self.points if points is None else points) - centre
         turned = np.concatenate([p @ rotation.T, p @ rotation]) + centre
-        distance = self.distance(turned)
-        # Whatever the tessellation might explain; the rest need not be asked.
-        high = np.flatnonzero(distance > self.tolerance) if self._curves else np.zeros(0, dtype=np.int64)
-        if len(high):
-            here = np.concatenate([p, p])[high] + centre
-            distance[high] -= np.maximum(self._allowance(here), self._allowance(turned[high]))
-        return float(distance.max(initial=0.0))
+        return float(self._beyond_facets(np.concatenate([p, p]) + centre, turned, self.tolerance).max(initial=0.0))
 
     def roughly(self, rotations: Array) -> float:
         """As ``residual`` of the worst of ``rotations`` ``(R, 3, 3)``, over a few points and in one go."""
         points = self.screen[:: SCREEN_POINTS // 30]
         turned = np.einsum("rij,pj->rpi", rotations, points).reshape(-1, 3)
-        distance = self.distance(turned)
-        if self._curves:
-            here = np.broadcast_to(points, (len(rotations), *points.shape)).reshape(-1, 3)
-            high = np.flatnonzero(distance > self.tolerance)
-            distance[high] -= np.maximum(self._allowance(here[high]), self._allowance(turned[high]))
-        return float(distance.max(initial=0.0))
+        here = np.broadcast_to(points, (len(rotations), *points.shape)).reshape(-1, 3)
+        return float(self._beyond_facets(here, turned, self.tolerance).max(initial=0.0))
 
     def distances(self, rotation: Array, translation: Array) -> Array:
         """Distances ``(P,)`` in metres of the turned and moved test points to the surface."""
@@ -80,10 +70,7 @@ class RotationCheck:
         """Largest distance in metres of the turned, or mirrored, and moved test points to the surface, beyond the
         heights of the facets that meet."""
         turned = self.points @ rotation.T + translation
-        distance = self.distance(turned)
-        if self._curves:
-            distance = distance - np.maximum(self._allowance(self.points), self._allowance(turned))
-        return max(0.0, float(distance.max()))
+        return float(self._beyond_facets(self.points, turned, 0.0).max(initial=0.0))
 
     def means(self, rotations: Array, most: int = 96) -> Array:
         """Mean distances ``(R,)`` in metres of some screening points under ``rotations`` ``(R, 3, 3)``: what searches
@@ -145,6 +132,15 @@ class RotationCheck:
         # Along the axis of the turns nothing is known, and 0 is taken.
         centre = np.linalg.lstsq(rows, shifts, rcond=0.1)[0]
         return np.asarray(centre * min(1.0, self.facet_height / max(float(np.linalg.norm(centre)), 1e-300)))
+
+    def _beyond_facets(self, here: Array, turned: Array, above: float) -> Array:
+        """Distances ``(N,)`` of ``turned`` ``(N, 3)`` to the surface; of those above ``above`` the heights of the
+        facets there and at ``here`` ``(N, 3)``, where the points come from, are taken away."""
+        distance = self.distance(turned)
+        high = np.flatnonzero(distance > above) if self._curves else np.zeros(0, dtype=np.int64)
+        if len(high):
+            distance[high] -= np.maximum(self._allowance(here[high]), self._allowance(turned[high]))
+        return distance
 
     def _allowance(self, points: Array) -> Array:
         """Height ``(N,)`` of the facets of a curve that ``points`` ``(N, 3)`` belong to, 0 away from curves."""
